@@ -1,0 +1,54 @@
+"""Checks of arguments and of data from outside, with one form of message.
+
+A message names the argument (or the file and the field), the rule, and what came.
+"""
+
+from collections.abc import Sequence
+from typing import NoReturn
+
+import numpy as np
+
+
+class InputError(ValueError):
+    """Bad data from outside: a file, a command line, an array a user handed in.
+
+    The commands print its text as their one line of error and end with status 2.
+    """
+
+
+def bad_input(where: object, field: str, *, expected: object, got: object) -> NoReturn:
+    """Raises the one message of this project about bad data: place, field, rule, and what came."""
+    raise InputError(f"{where}: {field}: expected {expected}, got {got}")
+
+
+def check_last_axis(name: str, array, size: int) -> None:
+    """Raises ValueError unless `array` has last axis `size`."""
+    if array.ndim < 1 or array.shape[-1] != size:
+        raise ValueError(f"{name}: expected shape (..., {size}), got {tuple(array.shape)}")
+
+
+def check_at_least(name: str, value: int | float, smallest: int | float) -> None:
+    """Raises ValueError unless `value` >= `smallest`."""
+    if not value >= smallest:
+        raise ValueError(f"{name}: expected a value >= {smallest}, got {value}")
+
+
+def check_one_of(name: str, value: object, allowed: Sequence[object]) -> None:
+    """Raises ValueError unless `value` is one of `allowed`."""
+    if value not in allowed:
+        raise ValueError(f"{name}: expected one of {', '.join(map(str, allowed))}, got {value}")
+
+
+def check_order(order: int, coefficients: int | None = None) -> None:
+    """Raises ValueError unless `order` is a positive number of SH bands that fits the coefficient count."""
+    check_at_least("order", order, 1)
+    if coefficients is not None and coefficients != order**2:
+        raise ValueError(f"sh: expected {order**2} coefficients for order {order}, got {coefficients}")
+
+
+def check_finite(where: object, field: str, array) -> None:
+    """Raises InputError if a NaN or an infinity is in `array`; says how many and where the first one is."""
+    finite = np.isfinite(array)
+    if not finite.all():
+        first = tuple(int(i) for i in np.argwhere(~finite)[0])
+        bad_input(where, field, expected="finite numbers", got=f"{(~finite).sum()} NaN or Inf, first at {first}")
