@@ -27,6 +27,12 @@ def check_last_axis(name: str, array, size: int) -> None:
         raise ValueError(f"{name}: expected shape (..., {size}), got {tuple(array.shape)}")
 
 
+def check_same_shape(names: str, a, b) -> None:
+    """Raises ValueError unless `a` and `b` have one shape; `names` names them both ("image and guide")."""
+    if a.shape != b.shape:
+        raise ValueError(f"{names}: expected one shape, got {tuple(a.shape)} and {tuple(b.shape)}")
+
+
 def check_at_least(name: str, value: int | float, smallest: int | float) -> None:
     """Raises ValueError unless `value` >= `smallest`."""
     if not value >= smallest:
@@ -51,4 +57,6 @@ def check_finite(where: object, field: str, array) -> None:
     finite = np.isfinite(array)
     if not finite.all():
         first = tuple(int(i) for i in np.argwhere(~finite)[0])
-        bad_input(where, field, expected="finite numbers", got=f"{(~finite).sum()} NaN or Inf, first at {first}")
+        bad_input(
+            where, field, expected="finite numbers", got=f"{(~finite).sum()} NaN or Inf, first at {first}"
+        )

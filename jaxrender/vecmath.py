@@ -67,3 +67,12 @@ def reflection_frame(wo: Float[Array, "*b 3"], n: Float[Array, "*b 3"]) -> Float
     r = normalize(2.0 * dot(n, wo) * n - wo)
     t = orthonormal_tangent(r)
     return jnp.stack([t, jnp.cross(r, t), r], axis=-1)
+
+
+def constant_like(table, x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A NumPy table as a constant of x's dtype, with leading axes of size 1 up to x's rank.
+
+    Broadcasts are written out in this package; this is how a table of trailing axes meets an array of any rank.
+    """
+    table = jnp.asarray(table, dtype=x.dtype)
+    return table.reshape((1,) * (x.ndim - table.ndim) + table.shape)

@@ -1,0 +1,143 @@
+"""The pinhole camera: transforms between world, view and pixels, camera rays, and automatic framing.
+
+View space has x to the right, y up and the eye looking down -z. Pixel (row, column) = (0, 0) is the top
+left one, and its centre is at (0.5, 0.5) in `_px` coordinates (x to the right, y down). All of it is
+differentiable in the camera. One camera at a time; batches are `vmap`.
+"""
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxrender import checks, vecmath
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Camera:
+    """Where the eye is, what it looks at, which way is up, and the full vertical field of view."""
+
+    eye: Float[Array, "3"]
+    target: Float[Array, "3"]
+    up: Float[Array, "3"]
+    fov_y_radians: Float[Array, ""]
+
+
+def look_at(eye: Float[Array, "3"], target: Float[Array, "3"], up: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """World-from-view rotation: its columns are right, up and backward (from the target to the eye).
+
+    An `up` along the line of sight leaves the roll open; it is then that of `vecmath.orthonormal_tangent`.
+    An eye at its target looks down -z of the world.
+    """
+    backward = eye - target
+    z = jnp.asarray([0.0, 0.0, 1.0], backward.dtype)
+    backward = jnp.where(jnp.sum(backward * backward) > 0, vecmath.normalize(backward), z)
+    return vecmath.frame_from_normal_tangent(backward, vecmath.normalize(jnp.cross(up, backward)))
+
+
+def view_from_world(camera: Camera) -> Float[Array, "4 4"]:
+    """The rigid transform of homogeneous points from world to view space."""
+    rotation = look_at(camera.eye, camera.target, camera.up).T
+    affine = jnp.concatenate([rotation, -(rotation @ camera.eye)[:, None]], axis=1)
+    return jnp.concatenate([affine, jnp.asarray([[0.0, 0.0, 0.0, 1.0]], affine.dtype)], axis=0)
+
+
+def camera_rays(
+    camera: Camera, *, height: int, width: int, offsets: Float[Array, "*#hw 2"] | None = None
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w 3"]]:
+    """Origins and unit directions of one ray per pixel.
+
+    Args:
+      offsets: where in its pixel a ray passes, (x, y) in [0, 1); (2,) or (h, w, 2). None is the centre.
+    Raises:
+      ValueError: if height or width is below 1.
+    """
+    checks.check_at_least("height", height, 1)
+    checks.check_at_least("width", width, 1)
+    dtype = camera.eye.dtype
+    offsets = jnp.full((2,), 0.5, dtype) if offsets is None else offsets
+    corner = jnp.stack(
+        jnp.meshgrid(jnp.arange(width, dtype=dtype), jnp.arange(height, dtype=dtype), indexing="xy"), axis=-1
+    )
+    px = corner + jnp.broadcast_to(offsets, corner.shape)
+    # On the plane z = -1 of view space a pixel is `step` wide and high.
+    step = 2.0 * jnp.tan(0.5 * camera.fov_y_radians) / height
+    x, y = (px[..., 0] - 0.5 * width) * step, (0.5 * height - px[..., 1]) * step
+    view = vecmath.normalize(jnp.stack([x, y, -jnp.ones_like(x)], axis=-1))
+    directions = view @ look_at(camera.eye, camera.target, camera.up).T
+    return jnp.broadcast_to(camera.eye, directions.shape), directions
+
+
+def project_px(
+    camera: Camera, points: Float[Array, "*b 3"], *, height: int, width: int
+) -> tuple[Float[Array, "*b 2"], Float[Array, "*b"]]:
+    """Pixel coordinates of world points, and their linear view depth (positive in front of the eye).
+
+    A point in the plane of the eye (depth 0) lands at (width / 2, height / 2).
+    """
+    world_from_view = look_at(camera.eye, camera.target, camera.up)
+    view = (points - jnp.broadcast_to(camera.eye, points.shape)) @ world_from_view
+    depth = -view[..., 2]
+    step = 2.0 * jnp.tan(0.5 * camera.fov_y_radians) / height
+    x = vecmath.safe_div(view[..., 0], depth * step) + 0.5 * width
+    y = 0.5 * height - vecmath.safe_div(view[..., 1], depth * step)
+    return jnp.stack([x, y], axis=-1), depth
+
+
+def frame_bounds(
+    minimum: Float[Array, "3"],
+    maximum: Float[Array, "3"],
+    *,
+    azimuth_radians: float | Float[Array, ""] = 0.0,
+    elevation_radians: float | Float[Array, ""] = 0.0,
+    fov_y_radians: float = math.radians(35.0),
+    aspect: int | float = 1.0,
+    margin: float = 0.05,
+) -> Camera:
+    """The camera that sees a whole box and no more, for example the bounds of a character over a clip.
+
+    The eye looks at the middle of the box. The distance is the smallest one at which all eight corners,
+    with `margin` (a share of the box) around them, lie inside the picture.
+
+    Args:
+      azimuth_radians: 0 looks at the front of a glTF character from +z; it grows towards +x.
+      elevation_radians: 0 is level, π/2 looks straight down.
+      aspect: width / height of the picture.
+    Raises:
+      ValueError: if aspect, margin or the field of view is out of its range.
+    """
+    if not aspect > 0:
+        raise ValueError(f"aspect: expected a value > 0, got {aspect}")
+    if not 0 < fov_y_radians < math.pi:
+        raise ValueError(f"fov_y_radians: expected a value between 0 and π, got {fov_y_radians}")
+    checks.check_at_least("margin", margin, 0.0)
+    dtype = minimum.dtype
+    azimuth, elevation = jnp.asarray(azimuth_radians, dtype), jnp.asarray(elevation_radians, dtype)
+    backward = jnp.stack(
+        [
+            jnp.cos(elevation) * jnp.sin(azimuth),
+            jnp.sin(elevation),
+            jnp.cos(elevation) * jnp.cos(azimuth),
+        ]
+    )
+    # The limit of "up is +y" at the poles: the picture does not roll while the camera passes overhead.
+    up = jnp.stack(
+        [
+            -jnp.sin(elevation) * jnp.sin(azimuth),
+            jnp.cos(elevation),
+            -jnp.sin(elevation) * jnp.cos(azimuth),
+        ]
+    )
+    center, half = 0.5 * (minimum + maximum), 0.5 * (1.0 + margin) * (maximum - minimum)
+    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1).reshape(8, 3)
+    corners = jnp.asarray(signs, dtype) * jnp.broadcast_to(half, (8, 3))
+    x, y, z = (corners @ look_at(backward, jnp.zeros_like(backward), up)).T
+    tangent = math.tan(0.5 * fov_y_radians)
+    distance = jnp.max(z + jnp.maximum(jnp.abs(x) / (tangent * aspect), jnp.abs(y) / tangent))
+    # A box without extent is seen from one unit away.
+    distance = jnp.where(distance > 0, distance, jnp.ones_like(distance))
+    return Camera(center + distance * backward, center, up, jnp.asarray(fov_y_radians, dtype))

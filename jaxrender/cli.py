@@ -1,0 +1,156 @@
+"""The `jaxrender` command: reads the command line, calls one pipeline, prints the paths it wrote."""
+
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxrender import console, doctor
+
+Out = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Trains a model on the built-in character and relights it: the whole of the main job in one go."""
+
+    out: Out = Path("out/demo")
+    """Folder for the model, the pictures and the report."""
+    seed: int = 0
+    """Seed of everything random."""
+    json: bool = False
+    """Print one JSON object instead of the list of files."""
+
+    def run(self) -> None:
+        from fitting import cli  # the one place where jaxrender calls a package above it
+
+        console.enable_compilation_cache()
+        cli.run_demo(self)
+
+
+@dataclass(frozen=True)
+class Relight:
+    """Renders a clip of a trained character under a turning environment with self-shadows."""
+
+    model: tyro.conf.Positional[Path | None] = None
+    """A trained model (model.safetensors, or the folder it is in). Without one, the built-in character."""
+    out: Out = Path("out/relight")
+    """Folder for the pictures."""
+    clip: str | None = None
+    """Name of the clip to play. By default the first one of the model."""
+    environment: Path | None = None
+    """A latitude-longitude HDR map (.hdr or .exr). By default a built-in sky."""
+    exponents: tuple[float, ...] = (1.0, 60.0)
+    """Phong exponents: one, or the two ends of a sweep over the clip; 1 is diffuse."""
+    turns: float = 1.0
+    """Full turns of the environment over the clip."""
+    membrane: bool = False
+    """Shade as a thin translucent sheet instead of a surface."""
+    truth: bool = False
+    """Trace the visibility too, and show model and truth side by side (slow)."""
+    size: tuple[int, int] = (512, 512)
+    """Width and height of a frame in pixels."""
+    azimuth_degrees: float = 25.0
+    """Where the camera stands: 0 looks at the front, growing towards the character's left."""
+    elevation_degrees: float = 10.0
+    """Height of the camera as an angle."""
+    fps: float = 24.0
+    """Frames per second."""
+    exr: bool = False
+    """Also write each frame as a linear OpenEXR image."""
+    seed: int = 0
+    """Seed of everything random."""
+    json: bool = False
+    """Print one JSON object instead of the list of files."""
+
+    def __post_init__(self):
+        if not 1 <= len(self.exponents) <= 2 or not all(0 <= e < math.inf for e in self.exponents):
+            raise ValueError(f"--exponents: expected one or two numbers of at least 0, got {self.exponents}")
+        if not all(1 <= side <= 8192 for side in self.size):
+            raise ValueError(f"--size: expected two numbers from 1 to 8192, got {self.size}")
+        if not 0 < self.fps < math.inf:
+            raise ValueError(f"--fps: expected a number above 0, got {self.fps}")
+
+    def run(self) -> None:
+        from fitting import cli
+
+        console.enable_compilation_cache()
+        cli.run_relight(self)
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Says what is installed, what it runs on, and what each missing extra would add.
+
+    Exit status 1 if something keeps other commands from working.
+    """
+
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        found = doctor.examine()
+        found["problems"] = doctor.problems(found)
+        if self.json:
+            console.print_json(found)
+        else:
+            _print_findings(found)
+        if found["problems"]:
+            raise SystemExit(1)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The console script; returns the exit status."""
+    argv = sys.argv[1:] if argv is None else argv
+    if argv == ["--version"]:
+        print(f"jaxrender {doctor.package_version('jaxrender')}")
+        return 0
+    description = "Real-time rendering methods as pure tensor kernels."
+    commands = Demo | Relight | Doctor
+    return console.run_command(
+        lambda: console.parse(commands, prog="jaxrender", description=description, argv=argv).run()
+    )
+
+
+def _print_findings(found: dict) -> None:
+    machine, cache, rays = (found[name] for name in ("machine", "compilation_cache", "rays"))
+    memory = console.format_bytes(machine["memory_bytes"]) if machine["memory_bytes"] else "unknown"
+    devices = [f"{device['platform']} ({device['kind']})" for device in found["devices"]["devices"]]
+    programs = f"{cache['programs']} programs, {console.format_bytes(cache['bytes'])}"
+    print("Machine")
+    _print_pairs(
+        {
+            "system": machine["system"],
+            "processor": f"{machine['cpu']}, {machine['cores']} cores",
+            "memory": memory,
+            "devices": ", ".join(devices) or "none",
+            "rays": f"{rays['backend']}, {rays['threads']} threads" if rays["works"] else "none",
+            "compiled programs": f"{cache['path']} ({programs})",
+        }
+    )
+    print("\nVersions")
+    packages = {name: version or "missing" for name, version in found["packages"].items()}
+    _print_pairs({"python": found["python"], **packages})
+    print("\nExtras (install them in the project's folder)")
+    for extra in found["extras"]:
+        missing = ", ".join(extra["missing"])
+        state = f"missing: {missing}; {extra['install']}" if missing else "installed"
+        print(f"  {extra['name']}: {extra['adds']}\n    {state}")
+    print()
+    for line in found["problems"]:
+        print(f"Problem: {line}")
+    if not found["problems"]:
+        print("All is well.")
+
+
+def _print_pairs(pairs: dict[str, str]) -> None:
+    width = max(map(len, pairs))
+    for name, value in pairs.items():
+        print(f"  {name:{width}}  {value}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

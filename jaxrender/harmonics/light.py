@@ -1,0 +1,105 @@
+"""Light as SH coefficients per colour channel: environment maps and lamps.
+
+A light has shape (c, order**2), world axes (right-handed, +Y up), radiance per channel.
+"""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxrender.checks import check_at_least, check_order
+from jaxrender.harmonics.sh import bands, order_of, sh_basis
+from jaxrender.harmonics.zh import zh_to_sh
+from jaxrender.vecmath import constant_like
+
+
+def environment_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (h, w, 3) of the pixel centres of a latitude-longitude image and their solid angles (h, w).
+
+    Row 0 is the zenith (+Y); the middle of the image looks down -Z and columns turn towards +X. The solid angles
+    are exact (cosine differences), 4π in all.
+    """
+    theta = (np.arange(height) + 0.5) * (math.pi / height)
+    phi = (np.arange(width) + 0.5) * (2 * math.pi / width) - math.pi
+    edges = np.cos(np.arange(height + 1) * (math.pi / height))
+    solid = np.repeat((edges[:-1] - edges[1:])[:, None] * (2 * math.pi / width), width, axis=1)
+    s, c = np.sin(theta)[:, None], np.cos(theta)[:, None]
+    parts = np.broadcast_arrays(s * np.sin(phi), c, -s * np.cos(phi))
+    return np.stack(parts, axis=-1), solid
+
+
+def project_environment(image: Float[Array, "h w c"], *, order: int) -> Float[Array, "c k"]:
+    """Projects a latitude-longitude radiance map on SH, one vector per channel.
+
+    Args:
+      image: linear radiance; row 0 is +Y, the middle looks down -Z, columns turn towards +X. It must be finite
+        (`jaxrender.io.read_environment` sees to that).
+    """
+    check_order(order)
+    if image.ndim != 3:
+        raise ValueError(f"image: expected shape (h, w, c), got {tuple(image.shape)}")
+    directions, solid = environment_directions(*image.shape[:2])
+    rows = jnp.asarray(directions, dtype=image.dtype)
+    weighted = image * jnp.asarray(solid, dtype=image.dtype)[..., None]
+    return jnp.einsum("hwc,hwk->ck", weighted, sh_basis(rows, order=order))
+
+
+def sh_directional_light(
+    direction: Float[Array, "*#b 3"], radiance: Float[Array, "*#b c"], *, order: int
+) -> Float[Array, "*b c k"]:
+    """A lamp at infinity: `radiance` · δ(s - direction), as radiance · y(direction).
+
+    Args:
+      direction: unit vector towards the lamp.
+      radiance: irradiance on a plane that faces the lamp, per channel.
+    """
+    return radiance[..., :, None] * sh_basis(direction, order=order)[..., None, :]
+
+
+def sh_area_light(
+    direction: Float[Array, "*#b 3"],
+    radius_radians: Float[Array, "*#b"],
+    radiance: Float[Array, "*#b c"],
+    *,
+    order: int,
+) -> Float[Array, "*b c k"]:
+    """A disc of sky: constant radiance within `radius_radians` (0..π) of a unit direction.
+
+    z_l = 2π √((2l+1)/4π) ∫_{cos r}^1 P_l, written with sin² r and P'_l so that a small disc does not cancel.
+    """
+    check_order(order)
+    x = jnp.cos(radius_radians)
+    sine2 = jnp.sin(radius_radians) ** 2
+    # p' obeys P'_{l+1} = P'_{l-1} + (2l+1) P_l, and ∫_x^1 P_l = (1-x²) P'_l(x) / (l(l+1)).
+    p, dp = [jnp.ones_like(x), x], [jnp.zeros_like(x), jnp.ones_like(x)]
+    for l in range(1, order):
+        p.append(((2 * l + 1) * x * p[l] - l * p[l - 1]) / (l + 1))
+        dp.append(dp[l - 1] + (2 * l + 1) * p[l])
+    caps = [2.0 * jnp.sin(0.5 * radius_radians) ** 2]
+    caps += [sine2 * dp[l] / (l * (l + 1)) for l in range(1, order)]
+    factors = 2 * math.pi * np.sqrt((2 * np.arange(order) + 1) / (4 * math.pi))
+    zh = jnp.stack(caps, axis=-1)
+    zh = zh * constant_like(factors, zh)
+    return radiance[..., :, None] * zh_to_sh(zh, direction)[..., None, :]
+
+
+def sh_window(sh: Float[Array, "*b k"], *, width: float) -> Float[Array, "*b k"]:
+    """Damps ringing: band l times (1 + cos(π l / width)) / 2, and 0 from band `width` on.
+
+    Args:
+      width: in bands, > 0; the number of bands or somewhat above is usual.
+    References:
+      Sloan, "Stupid Spherical Harmonics (SH) Tricks", 2008, section on windowing.
+    """
+    check_at_least("width", width, 1e-6)
+    l = bands(order_of(sh))
+    window = np.where(l < width, 0.5 * (1 + np.cos(math.pi * l / width)), 0.0)
+    return sh * constant_like(window, sh)
+
+
+def rotate_environment(image: Float[Array, "h w c"], angle_radians: float) -> Float[Array, "h w c"]:
+    """Turns a map about +Y by whole columns, counter-clockwise seen from above for a positive angle."""
+    shift = -round(angle_radians / (2 * math.pi) * image.shape[1])
+    return jnp.roll(image, shift, axis=1)

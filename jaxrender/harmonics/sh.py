@@ -1,0 +1,245 @@
+"""Real spherical harmonics of any order: basis, projection, evaluation, rotation, product, layouts.
+
+Pointwise: any leading axes. Coefficients are orthonormal with the Condon-Shortley sign, index l(l+1)+m,
+`order` counts bands. Directions are unit vectors. Everything is polynomial in x, y, z, hence
+differentiable everywhere, poles included. Checked to order 10.
+"""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from jaxrender.checks import check_last_axis, check_one_of, check_order
+from jaxrender.vecmath import constant_like
+
+LAYOUTS = ("gaussian_splatting", "e3nn", "scipy", "positive")
+
+
+def order_of(sh) -> int:
+    """Number of bands of a coefficient array, from its last axis; ValueError if that is not a square."""
+    order = math.isqrt(sh.shape[-1])
+    check_order(order, sh.shape[-1])
+    return order
+
+
+def bands(order: int) -> np.ndarray:
+    """The band l of each coefficient: (0, 1, 1, 1, 2, ...), shape (order**2,)."""
+    return np.repeat(np.arange(order), 2 * np.arange(order) + 1)
+
+
+def basis_columns(x, y, z, *, order: int) -> list:
+    """The order**2 basis functions as a list of arrays shaped like x; NumPy or JAX arrays alike.
+
+    With (x + iy)^m = c_m + i s_m and the Legendre part Q_l^m(z) = P_l^m(z) / (1 - z²)^{m/2}, normalised,
+    y_{l,m} = √2 (-1)^m Q_l^m c_m and y_{l,-m} = √2 (-1)^m Q_l^m s_m. Q obeys the usual three-term
+    recurrence upward in l, which is stable.
+    """
+    columns = [None] * order**2
+    c, s = x * 0.0 + 1.0, x * 0.0
+    diagonal = 1.0 / math.sqrt(4.0 * math.pi)
+    for m in range(order):
+        previous, q = x * 0.0, x * 0.0 + diagonal
+        for l in range(m, order):
+            if l > m:
+                a = math.sqrt((4 * l * l - 1) / (l * l - m * m))
+                b = math.sqrt(((l - 1) ** 2 - m * m) / (4 * (l - 1) ** 2 - 1))
+                previous, q = q, a * (z * q - b * previous)
+            scale = (-1) ** m * math.sqrt(2.0) if m else 1.0
+            columns[l * (l + 1) + m] = scale * q * c
+            if m:
+                columns[l * (l + 1) - m] = scale * q * s
+        c, s = x * c - y * s, x * s + y * c
+        diagonal *= math.sqrt((2 * m + 3) / (2 * m + 2))
+    return columns
+
+
+def sh_basis(directions: Float[Array, "*b 3"], *, order: int) -> Float[Array, "*b k"]:
+    """Evaluates the first `order` bands at unit directions.
+
+    Args:
+      directions: unit vectors.
+      order: number of bands, >= 1; k = order².
+    References:
+      Sloan, "Stupid Spherical Harmonics (SH) Tricks", 2008, appendix A2 (sign and normalisation).
+    """
+    check_last_axis("directions", directions, 3)
+    check_order(order)
+    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
+    return jnp.stack(basis_columns(x, y, z, order=order), axis=-1)
+
+
+def sh_project(
+    values: Float[Array, "*b n"], directions: Float[Array, "n 3"], weights: Float[Array, " n"], *, order: int
+) -> Float[Array, "*b k"]:
+    """Quadrature projection c_i = Σ_n w_n f(s_n) y_i(s_n).
+
+    Args:
+      values: f at the directions.
+      weights: solid angle of each direction, in steradians (4π in all for the sphere).
+    """
+    return values @ (sh_basis(directions, order=order) * weights[:, None])
+
+
+def sh_evaluate(sh: Float[Array, "*#b k"], directions: Float[Array, "*#b 3"]) -> Float[Array, "*b"]:
+    """f(s) = Σ_i c_i y_i(s) at unit directions; leading axes broadcast, rank for rank."""
+    return jnp.sum(sh * sh_basis(directions, order=order_of(sh)), axis=-1)
+
+
+@functools.lru_cache
+def rotation_table(order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Fixed axes d_i and the matrix that writes coefficients as Σ_i c_{l,i} P_l-lobes along them.
+
+    Band l of any function is spanned by 2l+1 generic translates of one zonal function (reference:
+    Nowrouzezahrai, Simari, Fiume, "Sparse Zonal Harmonic Factorization", 2012). All bands share
+    2·order-1 axes, so that rotating means to rotate the axes and to evaluate again.
+
+    Returns:
+      axes (2·order-1, 3) and analysis (2·order-1, order²): c_{l,i} = Σ_m analysis[i, lm] f_lm.
+    """
+    count = 2 * order - 1
+    best = None
+    # A handful of seeded spirals over the half sphere; the best conditioned one is kept. Antipodal
+    # axes span the same lobe, so only a half sphere is covered.
+    rng = np.random.default_rng(0)
+    for _ in range(200 if order > 1 else 1):
+        z = (np.arange(count) + rng.uniform(0.1, 0.9)) / count
+        phi = np.arange(count) * math.pi * (3 - math.sqrt(5)) * rng.uniform(0.5, 1.5) + rng.uniform(0, 6.3)
+        r = np.sqrt(1 - z * z)
+        axes = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
+        basis = np.stack(basis_columns(*axes.T, order=order), axis=-1)
+        condition = max(np.linalg.cond(basis[:, l * l : (l + 1) ** 2]) for l in range(order))
+        if best is None or condition < best[0]:
+            best = condition, axes, basis
+    _, axes, basis = best
+    pieces = [np.linalg.pinv(basis[:, l * l : (l + 1) ** 2].T) for l in range(order)]
+    return axes, np.concatenate(pieces, axis=-1)
+
+
+def sh_rotate(sh: Float[Array, "*#b k"], rotation: Float[Array, "*#b 3 3"]) -> Float[Array, "*b k"]:
+    """Rotates a function: f'(s) = f(Rᵀ s), so that a lobe along d moves to R d.
+
+    Exact for every order (up to rounding). Differentiable in both arguments; the rotation is used as it
+    comes, so a matrix that is not orthonormal gives another polynomial, not an error.
+
+    Args:
+      rotation: rotation matrices, acting on column vectors.
+    """
+    check_last_axis("rotation", rotation, 3)
+    order = order_of(sh)
+    axes, analysis = (jnp.asarray(t, dtype=sh.dtype) for t in rotation_table(order))
+    turned = jnp.einsum("...ij,nj->...ni", rotation, axes)
+    basis = sh_basis(turned, order=order)
+    # Σ_i y_lm(R d_i) · analysis[i, lm'] f_lm', summed within each band: first m' then i.
+    members = jnp.asarray(np.eye(order)[bands(order)], dtype=sh.dtype)
+    per_band = jnp.einsum("...k,nk,kl->...nl", sh, analysis, members)
+    return jnp.einsum("...nk,...nl,kl->...k", basis, per_band, members)
+
+
+@functools.lru_cache
+def sphere_quadrature(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Legendre × uniform azimuth: directions (n, 3), weights (n,), exact up to `degree`."""
+    z, wz = np.polynomial.legendre.leggauss(degree // 2 + 1)
+    phi = np.arange(degree + 1) * (2 * math.pi / (degree + 1))
+    r = np.sqrt(1 - z * z)[:, None]
+    grid = np.broadcast_arrays(r * np.cos(phi), r * np.sin(phi), z[:, None])
+    weights = np.repeat(wz * (2 * math.pi / (degree + 1)), degree + 1)
+    return np.stack(grid, axis=-1).reshape(-1, 3), weights
+
+
+def sh_product(
+    a: Float[Array, "*#b ka"], b: Float[Array, "*#b kb"], *, order: int | None = None
+) -> Float[Array, "*b k"]:
+    """Coefficients of the pointwise product f·g, truncated to `order` bands.
+
+    Both are evaluated on a quadrature that is exact for the degree in play, multiplied and projected
+    back, which is the triple-product tensor C_ijk without storing it.
+
+    Args:
+      order: bands of the result; default: those of `a`. The whole product has order_a + order_b - 1.
+    """
+    order_a, order_b = order_of(a), order_of(b)
+    order = order_a if order is None else order
+    directions, weights = sphere_quadrature(order_a + order_b + order - 3)
+    table = np.stack(basis_columns(*directions.T, order=max(order_a, order_b, order)))
+    y = jnp.asarray(table, dtype=a.dtype)
+    product = (a @ y[: order_a**2]) * (b @ y[: order_b**2])
+    return (product * constant_like(weights, product)) @ y[: order**2].T
+
+
+def sh_convolve_zonal(sh: Float[Array, "*#b k"], kernel: Float[Array, "*#b l"]) -> Float[Array, "*b k"]:
+    """Convolution with a kernel that is circular about each direction: (k*f)_lm = √(4π/(2l+1)) k_l f_lm."""
+    order = order_of(sh)
+    check_last_axis("kernel", kernel, order)
+    factors = np.sqrt(4 * math.pi / (2 * np.arange(order) + 1))
+    return sh * (kernel * constant_like(factors, kernel))[..., bands(order)]
+
+
+def _sign_of_m(order: int) -> np.ndarray:
+    m = np.concatenate([np.arange(-l, l + 1) for l in range(order)])
+    return np.where(m % 2, -1.0, 1.0)
+
+
+# e3nn measures the polar angle from +y: its basis at (x, y, z) is the all-positive one at (z, x, y).
+_E3NN_FROM_OURS = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def sh_to_layout(sh: Float[Array, "*b k"], layout: str) -> Float[Array, "*b k"] | Complex[Array, "*b k"]:
+    """Rewrites coefficients for another library, so that they mean the same function there.
+
+    Args:
+      layout: `gaussian_splatting` (3D Gaussian Splatting, gsplat: the same as ours), `positive` (the table
+        without the sign (-1)^m), `e3nn` (`spherical_harmonics(..., normalization="integral")`, whose polar axis is
+        y) or `scipy` (complex coefficients of `scipy.special.sph_harm_y`, index l(l+1)+m).
+    """
+    check_one_of("layout", layout, LAYOUTS)
+    order = order_of(sh)
+    sign = constant_like(_sign_of_m(order), sh)
+    if layout == "gaussian_splatting":
+        return sh
+    if layout == "positive":
+        return sh * sign
+    if layout == "e3nn":
+        return _rotate_by_constant(sh, _E3NN_FROM_OURS) * sign
+    real, imaginary = _complex_tables(order)
+    return jax.lax.complex(sh @ jnp.asarray(real, dtype=sh.dtype), sh @ jnp.asarray(imaginary, dtype=sh.dtype))
+
+
+def sh_from_layout(
+    sh: Float[Array, "*b k"] | Complex[Array, "*b k"], layout: str
+) -> Float[Array, "*b k"]:
+    """The inverse of `sh_to_layout`. From `scipy` the function is taken to be real."""
+    check_one_of("layout", layout, LAYOUTS)
+    order = order_of(sh)
+    if layout == "gaussian_splatting":
+        return sh
+    if layout == "scipy":
+        real, imaginary = _complex_tables(order)
+        x, y = jnp.real(sh), jnp.imag(sh)
+        return x @ jnp.asarray(real.T, dtype=x.dtype) + y @ jnp.asarray(imaginary.T, dtype=x.dtype)
+    positive = sh * constant_like(_sign_of_m(order), sh)
+    return positive if layout == "positive" else _rotate_by_constant(positive, _E3NN_FROM_OURS.T)
+
+
+def _rotate_by_constant(sh, rotation: np.ndarray):
+    matrix = jnp.asarray(rotation, dtype=sh.dtype)
+    return sh_rotate(sh, jnp.broadcast_to(matrix, (*sh.shape[:-1], 3, 3)))
+
+
+def _complex_tables(order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Real and imaginary part of the unitary matrix from real to complex coefficients.
+
+    y_{l,m} = √2 Re Y_l^m and y_{l,-m} = √2 Im Y_l^m for m > 0, with Y_l^{-m} = (-1)^m conj(Y_l^m).
+    """
+    real, imaginary = np.zeros((2, order**2, order**2))
+    for l in range(order):
+        centre = l * (l + 1)
+        real[centre, centre] = 1.0
+        for m in range(1, l + 1):
+            plus, minus, sign = centre + m, centre - m, (-1.0) ** m
+            real[plus, plus], real[plus, minus] = math.sqrt(0.5), sign * math.sqrt(0.5)
+            imaginary[minus, plus], imaginary[minus, minus] = -math.sqrt(0.5), sign * math.sqrt(0.5)
+    return real, imaginary

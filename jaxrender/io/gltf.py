@@ -1,0 +1,177 @@
+"""glTF 2.0 and GLB -> `Character`: container -> nodes -> meshes -> one skin -> clips.
+
+Every mesh of the default scene becomes part of one surface, whose palette has an entry for each joint of each
+skin and for each node that carries a rigid mesh. Supported: every accessor type, sparse and normalised
+accessors, interleaved data, KHR_mesh_quantization; triangles, strips and fans; any number of
+influences; STEP, LINEAR and CUBICSPLINE. Refused by name: morph targets and required extensions such as
+Draco or meshopt compression.
+"""
+
+import os
+import pathlib
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrender.animation.skinning import Character, Skin
+from jaxrender.io.gltf_accessors import LARGEST_NUMBER, read_floats
+from jaxrender.io.gltf_clips import read_clips
+from jaxrender.io.gltf_container import Container, printable
+from jaxrender.io.gltf_meshes import Surface, read_surface
+from jaxrender.io.gltf_nodes import build_skeleton, read_nodes, scene_nodes
+
+
+def read_gltf(path: str | os.PathLike) -> Character:
+    """Reads a character from a .gltf or .glb file.
+
+    The file may be anything: what cannot be read is refused with one line, and no size in it is believed
+    before it is checked. External buffers and images are read from the file's own folder only.
+
+    Returns:
+      The character; its `notes` say what was repaired (zero-area faces dropped, weights renormalised) or
+      left out (points and lines, unreadable textures).
+    Raises:
+      InputError: naming the file, the field, what was expected and what came.
+    """
+    source = Container(pathlib.Path(path))
+    graph = read_nodes(source)
+    palette = _Palette(source)
+    surfaces = []
+    for node in scene_nodes(source, graph):
+        surfaces += _read_instance(source, node, palette)
+    if not surfaces:
+        left_out = "; ".join(source.notes) or "no mesh in the scene"
+        source.bad("meshes", expected="at least one triangle", got=left_out)
+    skeleton, joint_of = build_skeleton(source, graph, palette.nodes)
+    surface = _merged(surfaces)
+    surface = _oriented(source, surface, graph.world_matrices()[palette.nodes] @ palette.inverse_binds())
+    return Character(
+        name=printable(source.path.stem),
+        skeleton=skeleton,
+        skin=Skin(
+            vertices=jnp.asarray(surface.vertices),
+            normals=jnp.asarray(surface.normals),
+            joint_indices=jnp.asarray(surface.joints, dtype=jnp.int32),
+            weights=jnp.asarray(surface.weights),
+            palette_joints=jnp.asarray([joint_of[node] for node in palette.nodes], dtype=jnp.int32),
+            inverse_binds=jnp.asarray(palette.inverse_binds(), dtype=jnp.float32),
+        ),
+        faces=jnp.asarray(surface.faces, dtype=jnp.int32),
+        clips=read_clips(source, joint_of),
+        albedo=jnp.asarray(surface.albedo),
+        content_hash=source.content_hash(),
+        unit_scale=1.0,
+        notes=source.notes,
+    )
+
+
+class _Palette:
+    """Palette entries as they are asked for: one block for each skin, one entry for each rigid node."""
+
+    def __init__(self, source: Container):
+        self._source = source
+        self._first_entry: dict[tuple[str, int], int] = {}
+        self._inverse_binds: list[np.ndarray] = []
+        self.nodes: list[int] = []
+
+    def rigid(self, node: int) -> int:
+        """The entry of a node that carries a mesh without a skin."""
+        return self._block(("node", node), [node], np.eye(4)[None])
+
+    def skin(self, index: Any, where: str) -> tuple[int, int]:
+        """The first entry of a skin and the number of its joints."""
+        source, skin = self._source, self._source.item("skins", index, where)
+        field = f"skins[{index}]"
+        if not skin.joints:
+            source.bad(f"{field}.joints", expected="at least one joint", got="none")
+        for node in skin.joints:
+            source.item("nodes", node, f"{field}.joints")
+        if ("skin", index) not in self._first_entry:
+            inverse_binds = _read_inverse_binds(source, skin, f"{field}.inverseBindMatrices")
+            self._block(("skin", index), skin.joints, inverse_binds)
+        return self._first_entry["skin", index], len(skin.joints)
+
+    def inverse_binds(self) -> np.ndarray:
+        return np.concatenate(self._inverse_binds)
+
+    def _block(self, key: tuple[str, int], nodes: list[int], inverse_binds: np.ndarray) -> int:
+        if key not in self._first_entry:
+            self._first_entry[key] = len(self.nodes)
+            self.nodes.extend(nodes)
+            self._inverse_binds.append(inverse_binds)
+        return self._first_entry[key]
+
+
+def _read_inverse_binds(source: Container, skin: Any, where: str) -> np.ndarray:
+    """Inverse bind matrices of a skin's joints; the identity where the file has none."""
+    count = len(skin.joints)
+    if skin.inverseBindMatrices is None:
+        return np.broadcast_to(np.eye(4), (count, 4, 4))
+    columns = read_floats(source, skin.inverseBindMatrices, ("MAT4",), where)
+    if len(columns) < count:
+        source.bad(where, expected=f"{count} matrices, one a joint", got=len(columns))
+    matrices = columns[:count].reshape(-1, 4, 4).swapaxes(1, 2).astype(np.float64)
+    if not np.allclose(matrices[:, 3], [0, 0, 0, 1], rtol=0, atol=1e-3):
+        source.bad(where, expected="affine matrices (last row 0 0 0 1)", got="others")
+    matrices[:, 3] = [0, 0, 0, 1]
+    return matrices
+
+
+def _read_instance(source: Container, node_index: int, palette: _Palette) -> list[Surface]:
+    """The surfaces of the mesh on a node, if it has one, with joints counted in the palette."""
+    node = source.gltf.nodes[node_index]
+    if node.mesh is None:
+        return []
+    mesh = source.item("meshes", node.mesh, f"nodes[{node_index}].mesh")
+    num_joints = None
+    if node.skin is not None:
+        first, num_joints = palette.skin(node.skin, f"nodes[{node_index}].skin")
+    surfaces = []
+    for i, primitive in enumerate(mesh.primitives):
+        where = f"meshes[{node.mesh}].primitives[{i}]"
+        surface = read_surface(source, primitive, num_joints, where)
+        if surface is not None:
+            if num_joints is None:
+                first = palette.rigid(node_index)
+            surfaces.append(replace(surface, joints=surface.joints + first))
+    return surfaces
+
+
+def _merged(surfaces: list[Surface]) -> Surface:
+    """One surface of all, with as many influences a vertex as any vertex needs, the largest first."""
+    starts = np.cumsum([0] + [len(surface.vertices) for surface in surfaces])
+    width = max(surface.weights.shape[1] for surface in surfaces)
+
+    def padded(values: np.ndarray) -> np.ndarray:
+        return np.pad(values, ((0, 0), (0, width - values.shape[1])))
+
+    joints = np.concatenate([padded(surface.joints) for surface in surfaces])
+    weights = np.concatenate([padded(surface.weights) for surface in surfaces])
+    largest_first = np.argsort(-weights, axis=1, kind="stable")
+    used = max(int((weights > 0).sum(axis=1).max()), 1)
+    return Surface(
+        vertices=np.concatenate([surface.vertices for surface in surfaces]),
+        normals=np.concatenate([surface.normals for surface in surfaces]),
+        faces=np.concatenate([s.faces + start for s, start in zip(surfaces, starts, strict=False)]),
+        albedo=np.concatenate([surface.albedo for surface in surfaces]),
+        joints=np.take_along_axis(joints, largest_first, axis=1)[:, :used],
+        weights=np.take_along_axis(weights, largest_first, axis=1)[:, :used],
+    )
+
+
+def _oriented(source: Container, surface: Surface, palette: np.ndarray) -> Surface:
+    """The surface with the faces turned round that the rest pose mirrors, as the outside stays outside.
+
+    Also the place where a character that its own rest pose throws out of the range of numbers is refused.
+    """
+    with np.errstate(all="ignore"):
+        blended = np.zeros((len(surface.vertices), 3, 4))
+        for k in range(surface.weights.shape[1]):
+            blended += surface.weights[:, k, None, None] * palette[surface.joints[:, k], :3]
+        posed = np.einsum("vij,vj->vi", blended[..., :3], surface.vertices) + blended[..., 3]
+        if not (np.abs(posed) <= LARGEST_NUMBER).all():
+            source.bad("rest pose", expected=f"vertices within {LARGEST_NUMBER:g}", got="some beyond or NaN")
+        handedness = np.linalg.det(blended[..., :3])[surface.faces].mean(axis=1)
+    return replace(surface, faces=np.where(handedness[:, None] < 0, surface.faces[:, ::-1], surface.faces))

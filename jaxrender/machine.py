@@ -1,0 +1,57 @@
+"""The machine a command runs on: processor, cores, and the folder where compiled programs are kept."""
+
+import contextlib
+import hashlib
+import os
+import pathlib
+import platform
+
+import jax
+
+
+def num_cores() -> int:
+    """The cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def cpu_model() -> str:
+    """The processor's name, as far as the system tells."""
+    return _cpu_info("model name") or platform.processor() or platform.machine()
+
+
+def cache_path() -> pathlib.Path:
+    """Where compiled programs are kept: JAX_COMPILATION_CACHE_DIR, or a folder in the user's cache.
+
+    One folder per kind of processor: home folders are shared between machines, and a program compiled for
+    the instructions of one may not run on another.
+    """
+    chosen = getattr(jax.config, "jax_compilation_cache_dir", None)
+    if chosen:
+        return pathlib.Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    kind = f"{platform.machine()} {cpu_model()} {_cpu_info('flags')}"
+    return pathlib.Path(base, "jaxrender", f"xla-{hashlib.sha256(kind.encode()).hexdigest()[:12]}")
+
+
+def is_writable_folder(path: pathlib.Path) -> bool:
+    """Whether files can be made in `path`, which is made first if it is missing."""
+    probe = path / f".probe-{os.getpid()}"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError:
+        return False
+    return True
+
+
+def _cpu_info(key: str) -> str:
+    """The first value of `key` in Linux's list of processors; empty elsewhere."""
+    with contextlib.suppress(OSError):
+        for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == key:
+                return value.strip()
+    return ""

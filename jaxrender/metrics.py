@@ -1,0 +1,98 @@
+"""How far an image or a table of numbers is from its reference, and pictures of the difference.
+
+Image metrics expect linear or display-encoded values with peak 1 and say nothing about which: name the
+encoding where you report them. All but `ssim` are pure and differentiable.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxrender import checks, vecmath
+
+# The colors of "inferno" at equal steps (Smith and van der Walt, 2015, CC0), as sRGB bytes: dark to bright
+# with steady lightness, so a heat map still reads when printed in gray.
+_INFERNO = (
+    (0, 0, 4), (22, 11, 57), (66, 10, 104), (106, 23, 110), (147, 38, 103), (188, 55, 84),
+    (221, 81, 58), (243, 120, 25), (252, 165, 10), (246, 215, 70), (252, 255, 164),
+)  # fmt: skip
+
+
+def mse(image: Float[Array, "*b"], reference: Float[Array, "*b"]) -> Float[Array, ""]:
+    """Mean squared error over all values, in the square of their unit."""
+    checks.check_same_shape("image and reference", image, reference)
+    difference = image - reference
+    return jnp.mean(difference * difference)
+
+
+def psnr(image: Float[Array, "*b"], reference: Float[Array, "*b"], *, peak: float = 1.0) -> Float[Array, ""]:
+    """Peak signal-to-noise ratio, 10 log₁₀(peak² / mse), in dB; infinite for equal images.
+
+    Not differentiable where the images are equal.
+    """
+    return -10.0 * jnp.log10(mse(image, reference) / peak**2)
+
+
+def relative_l2(values: Float[Array, "*b"], reference: Float[Array, "*b"]) -> Float[Array, ""]:
+    """‖values − reference‖ / ‖reference‖ over all values; 0 for an all-zero reference.
+
+    The gradient where both are equal is 0.
+    """
+    checks.check_same_shape("values and reference", values, reference)
+    difference = values - reference
+    return vecmath.safe_div(
+        vecmath.safe_sqrt(jnp.sum(difference * difference)), vecmath.safe_sqrt(jnp.sum(reference * reference))
+    )
+
+
+def ssim(
+    image: Float[Array | np.ndarray, "h w c"],
+    reference: Float[Array | np.ndarray, "h w c"],
+    *,
+    peak: float = 1.0,
+) -> float:
+    """Mean structural similarity in [-1, 1]; 1 for equal images. Computed by scikit-image, on the host.
+
+    Gaussian window of sigma 1.5 (11 x 11) and population covariances, as in the paper.
+
+    Raises:
+      ValueError: if the images differ in shape or are smaller than 11 pixels.
+    References:
+      Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural
+      similarity", IEEE TIP 13(4), 2004.
+    """
+    import skimage.metrics  # takes a second to import, and only a report needs it
+
+    checks.check_same_shape("image and reference", image, reference)
+    checks.check_at_least("image: height and width", min(image.shape[:2]), 11)
+    return float(
+        skimage.metrics.structural_similarity(
+            np.asarray(image, np.float64),
+            np.asarray(reference, np.float64),
+            channel_axis=-1,
+            data_range=peak,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+        )
+    )
+
+
+def heatmap(
+    values: Float[Array, "*b"], *, low: float = 0.0, high: float | None = None
+) -> Float[Array, "*b 3"]:
+    """Numbers as colors, black at `low` over red and orange to pale yellow at `high`; linear RGB.
+
+    Values outside are clamped; `high=None` takes the largest value. NaN becomes green, which the scale does
+    not hold. Piecewise linear in sRGB, so differentiable between the nodes.
+    """
+    lost = jnp.isnan(values)
+    values = jnp.where(lost, jnp.full_like(values, low), values)
+    top = jnp.max(values) if high is None else jnp.asarray(high, values.dtype)
+    t = jnp.clip(vecmath.safe_div(values - low, jnp.broadcast_to(top - low, values.shape)), 0.0, 1.0)
+    colors = jnp.asarray(_INFERNO, values.dtype) / 255.0
+    nodes = jnp.linspace(0.0, 1.0, len(_INFERNO), dtype=values.dtype)
+    srgb = jnp.stack([jnp.interp(t, nodes, colors[:, c]) for c in range(3)], axis=-1)
+    linear = jnp.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    green = jnp.broadcast_to(jnp.asarray([0.0, 1.0, 0.0], values.dtype), linear.shape)
+    return jnp.where(lost[..., None], green, linear)

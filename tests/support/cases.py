@@ -1,0 +1,677 @@
+"""One list of inputs for the twins: NumPy data, given to `jaxrender` and to `torchref` alike.
+
+A case names its kernel without the package ("harmonics.sh.sh_basis"). Arrays are float64 and are rounded to
+the dtype under test; records and options are built in either package from plain data.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from tests.support.tolerances import LONG_SUM, ROUNDING, TIGHT
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record of both packages, by its name without the package and its fields.
+
+    A `host` record holds NumPy arrays in both packages (clips, skeletons: data of the program).
+    """
+
+    name: str
+    fields: dict[str, Any]
+    host: bool = False
+
+
+def _whole(result: Any) -> Any:
+    return result
+
+
+def _second(result: Any) -> Any:
+    return result[1]
+
+
+def _residual_beside_1(fit: Any) -> tuple:
+    """A linear fit whose relative residual is judged on its scale, 1 = no better than the mean."""
+    return fit.weights, fit.bias, fit.rank, fit.residual + 1.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One call, made by keywords, and how far its two results may lie apart (units: see tolerances.py).
+
+    `gradients` names the array arguments whose derivatives are compared. Where an argument lives on a
+    manifold (`on`: "sphere" for unit vectors and quaternions, "rotation" for matrices) only the tangential
+    part counts, as the formulas of the two sides may differ off it.
+    """
+
+    kernel: str
+    arguments: dict[str, Any]
+    label: str = ""
+    gradients: tuple[str, ...] = ()
+    on: dict[str, str] = field(default_factory=dict)
+    ulps64: float = TIGHT
+    ulps32: float = ROUNDING
+    gradient_ulps64: float = TIGHT
+    gradient_ulps32: float = LONG_SUM
+    entrywise: bool = False  # each entry's own magnitude is the scale
+    host: bool = False  # runs on NumPy in float64 only: tables and bakes
+    outcome: Callable[[Any], Any] = _whole  # what of the result is compared
+
+    @property
+    def id(self) -> str:
+        return (
+            f"{self.kernel.split('.', 1)[-1]}[{self.label}]" if self.label else self.kernel.split(".", 1)[-1]
+        )
+
+
+_rng = np.random.default_rng(4711)
+
+
+def _normal(*shape: int) -> np.ndarray:
+    return _rng.normal(size=shape)
+
+
+def _uniform(low: float, high: float, *shape: int) -> np.ndarray:
+    return _rng.uniform(low, high, size=shape)
+
+
+def _unit(*shape: int, size: int = 3) -> np.ndarray:
+    v = _rng.normal(size=(*shape, size))
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def _rotation(*shape: int) -> np.ndarray:
+    q, _ = np.linalg.qr(_rng.normal(size=(*shape, 3, 3)))
+    return q * np.linalg.det(q)[..., None, None]
+
+
+def _spread_axes(n: int, num_lobes: int) -> np.ndarray:
+    """n sets of unit axes whose Gram matrices P_l(d_i·d_j), l < 4, have no small eigenvalue but zeros."""
+    sets = []
+    while len(sets) < n:
+        axes = _unit(num_lobes)
+        smallest = min(
+            np.linalg.eigvalsh(legendre.legval(axes @ axes.T, [0.0] * l + [1.0]))[-min(num_lobes, 2 * l + 1)]
+            for l in range(4)
+        )
+        if smallest > 0.1:
+            sets.append(axes)
+    return np.stack(sets)
+
+
+_POLES = np.concatenate([np.eye(3), -np.eye(3)])
+_SPHERE = np.concatenate([_POLES, _unit(10)])
+
+
+def _vecmath() -> list[Case]:
+    zeros = np.zeros((1, 3))
+    n = _unit(4)
+    parallel = np.concatenate([_normal(2, 3), 2.0 * n[2:3], zeros])
+    return [
+        Case("vecmath.dot", {"a": _normal(4, 3), "b": _normal(1, 3)}, gradients=("a", "b")),
+        Case("vecmath.safe_sqrt", {"x": np.array([-1.0, 0.0, 1e-20, 4.0])}, gradients=("x",)),
+        Case(
+            "vecmath.safe_div",
+            {"a": np.array([1.0, 0.0, 2.0]), "b": np.array([0.0, 0.0, -4.0])},
+            gradients=("a", "b"),
+        ),
+        Case("vecmath.normalize", {"v": np.concatenate([_normal(5, 3), zeros])}, gradients=("v",)),
+        Case("vecmath.orthonormal_tangent", {"n": _SPHERE}, gradients=("n",), on={"n": "sphere"}),
+        Case(
+            "vecmath.frame_from_normal_tangent",
+            {"normal": n, "tangent": parallel},
+            gradients=("normal", "tangent"),
+            on={"normal": "sphere"},
+        ),
+        Case(
+            "vecmath.reflection_frame",
+            {"wo": _unit(6), "n": _unit(6)},
+            gradients=("wo", "n"),
+            on={"wo": "sphere", "n": "sphere"},
+        ),
+    ]
+
+
+def _sh() -> list[Case]:
+    cases = [
+        Case(
+            "harmonics.sh.sh_basis",
+            {"directions": _SPHERE, "order": order},
+            f"order {order}",
+            gradients=("directions",),
+            on={"directions": "sphere"},
+        )
+        for order in (1, 4, 10)
+    ]
+    cases += [
+        Case(
+            "harmonics.sh.sh_project",
+            {"values": _normal(2, 9), "directions": _unit(9), "weights": _uniform(0, 1, 9), "order": 4},
+            gradients=("values", "directions", "weights"),
+            on={"directions": "sphere"},
+        ),
+        Case(
+            "harmonics.sh.sh_evaluate",
+            {"sh": _normal(5, 1, 16), "directions": _unit(5, 3)},
+            gradients=("sh", "directions"),
+            on={"directions": "sphere"},
+        ),
+        Case(
+            "harmonics.sh.sh_product",
+            {"a": _normal(3, 9), "b": _normal(1, 16)},
+            "default order",
+            gradients=("a", "b"),
+        ),
+        Case("harmonics.sh.sh_product", {"a": _normal(9), "b": _normal(16), "order": 6}, "whole product"),
+        Case("harmonics.sh.sh_product", {"a": _normal(36), "b": _normal(36), "order": 6}, "order 6"),
+        Case(
+            "harmonics.sh.sh_convolve_zonal",
+            {"sh": _normal(3, 25), "kernel": _normal(1, 5)},
+            gradients=("sh", "kernel"),
+        ),
+    ]
+    for order, lead in ((1, (2,)), (4, (3, 2)), (10, (2,))):
+        rotation = _rotation(*lead)
+        cases.append(
+            Case(
+                "harmonics.sh.sh_rotate",
+                {"sh": _normal(*lead[:-1], 1, order**2), "rotation": rotation},
+                f"order {order}",
+                gradients=("sh", "rotation"),
+                on={"rotation": "rotation"},
+                # Table methods solve for lobes on fixed axes; the condition number of that grows with order.
+                ulps32=LONG_SUM,
+            )
+        )
+    for layout in ("gaussian_splatting", "e3nn", "scipy", "positive"):
+        coefficients = _normal(2, 36)
+        theirs = coefficients
+        if layout == "scipy":  # that of a real function: c_l-m = (-1)^m conj c_lm
+            theirs = np.zeros((2, 36), dtype=complex)
+            for l in range(6):
+                i = l * (l + 1)
+                theirs[:, i] = coefficients[:, i]
+                for m in range(1, l + 1):
+                    theirs[:, i + m] = (coefficients[:, i + m] - 1j * coefficients[:, i - m]) / math.sqrt(2)
+                    theirs[:, i - m] = (-1) ** m * theirs[:, i + m].conj()
+        cases += [
+            Case(
+                "harmonics.sh.sh_to_layout", {"sh": coefficients, "layout": layout}, layout, ulps32=LONG_SUM
+            ),
+            Case("harmonics.sh.sh_from_layout", {"sh": theirs, "layout": layout}, layout, ulps32=LONG_SUM),
+        ]
+    return cases
+
+
+def _zh() -> list[Case]:
+    exponents = np.array([0.0, 0.37, 1.0, 2.0, 20.0, 1000.0])
+    return [
+        Case(
+            "harmonics.zh.zh_to_sh",
+            {"coefficients": _normal(6, 5), "axis": _unit(6)},
+            gradients=("coefficients", "axis"),
+            on={"axis": "sphere"},
+        ),
+        Case(
+            "harmonics.zh.lobes_to_sh",
+            {"coefficients": _normal(4, 2, 4), "axes": _unit(4, 2)},
+            gradients=("coefficients", "axes"),
+            on={"axes": "sphere"},
+        ),
+        Case("harmonics.zh.legendre", {"x": np.linspace(-1.0, 1.0, 9), "order": 10}, gradients=("x",)),
+        Case(
+            "harmonics.zh.zh_evaluate",
+            {"coefficients": _normal(1, 5), "axis": _unit(6), "directions": _unit(6)},
+            gradients=("coefficients", "axis", "directions"),
+            on={"axis": "sphere", "directions": "sphere"},
+        ),
+        Case("harmonics.zh.clamped_cosine_zh", {"order": 10}),
+        Case("harmonics.zh.hemisphere_zh", {"order": 10}),
+        Case(
+            "harmonics.zh.phong_zh", {"exponent": exponents, "order": 4}, "order 4", gradients=("exponent",)
+        ),
+        Case("harmonics.zh.phong_zh", {"exponent": exponents[1:], "order": 10}, "order 10", ulps32=LONG_SUM),
+    ]
+
+
+def _brdf_operator() -> list[Case]:
+    return [
+        # No exponent here makes an entry vanish, so each entry can be held to its own magnitude.
+        Case(
+            "harmonics.brdf_operator.phong_operator",
+            {"exponent": np.array([[0.37, 2.5], [20.0, 1000.0]])},
+            "entry by entry",
+            gradients=("exponent",),
+            entrywise=True,
+        ),
+        Case(
+            "harmonics.brdf_operator.phong_operator",
+            {"exponent": np.array([0.0, 1.0])},
+            "vanishing entries",
+            gradients=("exponent",),
+        ),
+        Case(
+            "harmonics.brdf_operator.phong_operator",
+            {"exponent": np.array([0.0, 1.0, 33.3, 1000.0]), "order": 10},
+            "order 10",
+            gradients=("exponent",),
+        ),
+        Case(
+            "harmonics.brdf_operator.phong_normalization",
+            {"exponent": _uniform(0, 9, 3)},
+            gradients=("exponent",),
+        ),
+        Case(
+            "harmonics.brdf_operator.brdf_operator",
+            {"kernel": lambda x: 1.0 / (0.5 + x * x), "order": 5, "num_nodes": 48},
+        ),
+        Case(
+            "harmonics.brdf_operator.apply_operator",
+            {"operator": _normal(1, 9, 9), "sh": _normal(4, 9)},
+            gradients=("operator", "sh"),
+        ),
+    ]
+
+
+def _light() -> list[Case]:
+    return [
+        Case("harmonics.light.environment_directions", {"height": 6, "width": 8}, host=True),
+        Case(
+            "harmonics.light.project_environment",
+            {"image": _uniform(0, 3, 8, 16, 3), "order": 5},
+            gradients=("image",),
+        ),
+        Case(
+            "harmonics.light.sh_directional_light",
+            {"direction": _unit(4), "radiance": _uniform(0, 2, 1, 3), "order": 4},
+            gradients=("direction", "radiance"),
+            on={"direction": "sphere"},
+        ),
+        Case(
+            "harmonics.light.sh_area_light",
+            {
+                "direction": _unit(4),
+                "radius_radians": np.array([0.01, 0.3, 1.7, 3.0]),
+                "radiance": _uniform(0, 2, 4, 3),
+                "order": 6,
+            },
+            gradients=("direction", "radius_radians", "radiance"),
+            on={"direction": "sphere"},
+        ),
+        Case(
+            "harmonics.light.sh_area_light",
+            {"direction": _unit(), "radius_radians": np.array(0.0047), "radiance": np.ones(3), "order": 10},
+            "sun",
+        ),
+        Case("harmonics.light.sh_window", {"sh": _normal(3, 25), "width": 4.0}, gradients=("sh",)),
+        *(
+            Case(
+                "harmonics.light.rotate_environment",
+                {"image": _normal(3, 12, 2), "angle_radians": angle},
+                f"{angle} rad",
+            )
+            for angle in (0.0, 0.7, -2.0, 9.0)
+        ),
+    ]
+
+
+def _zh_fit() -> list[Case]:
+    axis, reference = _unit(8), _rotation(8)
+    cases = [
+        Case(
+            "harmonics.zh_fit.axis_from_chart",
+            {"chart": np.concatenate([np.zeros((1, 2)), _normal(7, 2)]), "reference": reference},
+            gradients=("chart", "reference"),
+            on={"reference": "rotation"},
+        ),
+        Case(
+            "harmonics.zh_fit.chart_from_axis",
+            # Rounding of the axis is amplified by |chart|²/4 + 1 next to the far pole; the random axes here
+            # stay within 20 of it.
+            {"axis": axis, "reference": reference},
+            gradients=("axis", "reference"),
+            on={"axis": "sphere", "reference": "rotation"},
+        ),
+        Case("harmonics.zh_fit.reference_frames", {"axes": _SPHERE}),
+        Case(
+            "harmonics.zh_fit.optimal_linear_direction",
+            {"sh": np.concatenate([_normal(4, 16), np.zeros((1, 16))])},
+            gradients=("sh",),
+        ),
+    ]
+    # jaxrender damps each band's solve by 1e-8 of its Gram matrix, the twin cuts singular values instead.
+    # With no eigenvalue but zeros below 0.1 that moves z by at most 1e-6 relative; in float32, beside an
+    # exact zero, the damping's root, 1e-4, leaves eps / 1e-4.
+    damped = {"ulps64": 4.5e9, "ulps32": 1e4, "gradient_ulps64": 4.5e9, "gradient_ulps32": 1e4}
+    axis_sets = {f"{c} lobes": _spread_axes(4, c) for c in (1, 2, 3, 4)}
+    axis_sets["two lobes on one axis"] = axis_sets["2 lobes"][:, [0, 0, 1]]
+    for label, axes in axis_sets.items():
+        arguments = {"sh": _normal(4, 16), "axes": axes, "order": 4}
+        name, on = "harmonics.zh_fit.solve_lobe_coefficients", {"axes": "sphere"}
+        smooth = ("sh", "axes") if label != "two lobes on one axis" else ()
+        # The residual feels the damping in second order only.
+        cases.append(Case(name, arguments, label, gradients=smooth, on=on, **damped))
+        cases.append(Case(name, arguments, f"{label}, residual", outcome=_second))
+    return cases
+
+
+def _linear_model() -> list[Case]:
+    tall, wide = _normal(40, 6) + 2.0, _normal(7, 12) + 2.0
+    fit = {"weights": _normal(6, 4), "bias": _normal(4), "rank": np.array(6), "residual": np.array(0.1)}
+    return [
+        *(
+            Case(
+                "harmonics.linear_model.fit_linear",
+                {"features": a, "targets": _normal(len(a), 5), "ridge": ridge},
+                f"{name}, ridge {ridge:g}",
+                gradients=("features", "targets") if ridge else (),
+                outcome=_residual_beside_1,
+            )
+            for name, a in (("tall", tall), ("wide", wide))
+            for ridge in (0.0, 1e-3, 1.0)
+        ),
+        Case(
+            "harmonics.linear_model.fit_linear",
+            {"features": _normal(30, 2) @ _normal(2, 6), "targets": _normal(30, 3), "ridge": 0.0},
+            "rank 2 of 6",
+            outcome=_residual_beside_1,
+        ),
+        Case(
+            "harmonics.linear_model.predict_linear",
+            {"fit": Record("harmonics.linear_model.LinearFit", fit), "features": _normal(2, 3, 6)},
+            gradients=("features",),
+        ),
+    ]
+
+
+def _shading() -> list[Case]:
+    v, m = 5, 2
+    lobes = {"axes": _unit(v, m), "coefficients": _normal(v, m, 4), "frames": _rotation(v)}
+    surface = {"light": _normal(3, 16), "albedo": _uniform(0, 1, v, 3)}
+    view = {"positions": _normal(v, 3), "eye": np.array([0.3, 1.5, 6.0])}
+    manifolds = {
+        "axes": "sphere",
+        "frames": "rotation",
+        "world_from_local": "rotation",
+        "rotation": "rotation",
+    }
+    shared = tuple(lobes) + tuple(surface)
+    return [
+        Case("harmonics.membrane.back_lobe", {}),
+        Case(
+            "harmonics.membrane.membrane_transfer",
+            {"visibility": _normal(4, 16), "transmission": _uniform(0, 1, 4, 3)},
+            gradients=("visibility", "transmission"),
+        ),
+        Case(
+            "harmonics.relight.rotate_lobes",
+            {"axes": lobes["axes"], "rotation": lobes["frames"]},
+            gradients=("axes", "rotation"),
+            on=manifolds,
+        ),
+        *(
+            Case(
+                "harmonics.relight.phong_transfer",
+                {"visibility": _normal(v, 16), "exponent": exponent},
+                f"exponent {exponent.shape}",
+                gradients=("visibility", "exponent"),
+            )
+            for exponent in (np.array(12.5), _uniform(0, 90, v))
+        ),
+        Case(
+            "harmonics.relight.shade_transfer",
+            {"transfer": _normal(v, 16), "world_from_local": lobes["frames"], **surface},
+            gradients=("transfer", "world_from_local", "light", "albedo"),
+            on=manifolds,
+        ),
+        *(
+            Case(
+                "harmonics.relight.relight",
+                {**lobes, **surface, **view, "exponent": exponent},
+                f"exponent {exponent.shape}",
+                gradients=(*shared, *view, "exponent"),
+                on=manifolds,
+            )
+            for exponent in (np.array(1.0), _uniform(0, 90, v))
+        ),
+        Case("harmonics.relight.relight_diffuse", {**lobes, **surface}, gradients=shared, on=manifolds),
+        *(
+            Case(
+                "harmonics.relight.membrane",
+                {**lobes, **surface, "transmission": _uniform(0, 1, *shape)},
+                f"transmission {shape}",
+                gradients=(*shared, "transmission"),
+                on=manifolds,
+            )
+            for shape in ((3,), (v, 3))
+        ),
+    ]
+
+
+def _visibility() -> list[Case]:
+    corners = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
+    box = np.array(
+        [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
+         [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+    )  # fmt: skip
+    turn = _rotation()
+    positions = np.concatenate([corners, 0.4 * corners @ turn + [0.4, 2.1, 0.3]])
+    normals = np.concatenate([corners, corners @ turn]) / math.sqrt(3.0)
+    tangents = np.cross(normals, _unit(16))
+    tangents /= np.linalg.norm(tangents, axis=-1, keepdims=True)
+    frames = np.stack([tangents, np.cross(normals, tangents), normals], axis=-1)
+    directions = _unit(40)
+    directions[:, 2] = np.abs(directions[:, 2])
+    bits = _rng.integers(0, 256, size=(3, 5), dtype=np.uint8)
+    return [
+        Case("harmonics.visibility.hemisphere_directions", {"num_directions": 50}, host=True),
+        Case("harmonics.visibility.projection_table", {"directions": directions, "order": 4}, host=True),
+        Case(
+            "harmonics.visibility.trace_visibility",
+            {
+                "positions": positions,
+                "frames": frames,
+                "faces": np.concatenate([box, box + 8]).astype(np.int32),
+                "directions": directions,
+            },
+            "two boxes",
+            host=True,
+        ),
+        Case("harmonics.visibility.unpack_visibility", {"bits": bits, "num_directions": 37}),
+        Case(
+            "harmonics.visibility.project_visibility",
+            {"bits": bits, "table": _normal(37, 9)},
+            gradients=("table",),
+        ),
+    ]
+
+
+_PARENTS = (-1, 0, 1, 1, -1, 4)
+
+
+def _pose(*lead: int) -> Record:
+    j = len(_PARENTS)
+    return Record(
+        "animation.skeleton.Pose",
+        {
+            "translation": _normal(*lead, j, 3),
+            "rotation": _unit(*lead, j, size=4),
+            "scale": _uniform(0.5, 1.5, *lead, j, 3),
+        },
+    )
+
+
+def _skeleton() -> list[Case]:
+    a, b = _unit(7, size=4), _unit(7, size=4)
+    b[0], b[1] = a[0], -a[1]  # no turn at all, twice
+    b[2] = a[2] + 1e-5 * _normal(4)
+    b[2] /= np.linalg.norm(b[2])
+    vectors = np.concatenate(
+        [np.zeros((1, 3)), 1e-9 * _unit(1), 1e-3 * _unit(1), 3.0 * _unit(2), _normal(3, 3)]
+    )
+    half_angle = np.array([[0.0], [1e-8], [1e-3], [0.7], [1.5]])
+    quaternions = np.concatenate([np.sin(half_angle) * _unit(5), np.cos(half_angle)], axis=-1)
+    quaternions[3] = -quaternions[3]
+    quaternion = {"a": "sphere", "b": "sphere", "q": "sphere"}
+    key_times = np.array([0.1, 0.25, 0.7, 1.3])
+    # Before, at, between and after the keys; derivatives are compared where they exist.
+    times = np.array([-1.0, 0.1, 0.2, 0.5, 0.7, 1.1, 1.3, 2.0])
+    keys = {
+        ("STEP", False): _normal(4, 3),
+        ("LINEAR", False): _normal(4, 3),
+        ("LINEAR", True): _unit(4, size=4),
+        ("CUBICSPLINE", False): _normal(4, 3, 3),
+        ("CUBICSPLINE", True): np.stack([_normal(4, 4), _unit(4, size=4), _normal(4, 4)], axis=1),
+    }
+    return [
+        Case(
+            "animation.skeleton.quaternion_multiply",
+            {"a": a, "b": b[:1]},
+            gradients=("a", "b"),
+        ),
+        Case("animation.skeleton.quaternion_conjugate", {"q": a}, gradients=("q",)),
+        Case("animation.skeleton.quaternion_to_matrix", {"q": a}, gradients=("q",), on=quaternion),
+        Case(
+            "animation.skeleton.rotation_vector_to_quaternion",
+            {"rotation_vector": vectors},
+            gradients=("rotation_vector",),
+        ),
+        Case(
+            "animation.skeleton.quaternion_to_rotation_vector",
+            {"q": quaternions},
+            gradients=("q",),
+            on=quaternion,
+        ),
+        Case(
+            "animation.skeleton.slerp",
+            {"a": a, "b": b, "t": _uniform(0, 1, 7, 1)},
+            gradients=("a", "b", "t"),
+            on=quaternion,
+        ),
+        Case(
+            "animation.skeleton.cubic_spline",
+            {
+                "start": _normal(5, 3),
+                "out_tangent": _normal(5, 3),
+                "end": _normal(5, 3),
+                "in_tangent": _normal(5, 3),
+                "t": _uniform(0, 1, 5, 1),
+                "span": _uniform(0.1, 2, 5, 1),
+            },
+            gradients=("start", "out_tangent", "end", "in_tangent", "t", "span"),
+        ),
+        *(
+            Case(
+                "animation.skeleton.sample_keys",
+                {
+                    "key_times": key_times,
+                    "values": values,
+                    "times": times,
+                    "interpolation": interpolation,
+                    "rotation": rotation,
+                },
+                f"{interpolation}{', rotation' if rotation else ''}",
+                gradients=() if rotation else ("values",),
+            )
+            for (interpolation, rotation), values in keys.items()
+        ),
+        Case(
+            "animation.skeleton.sample_keys",
+            {
+                "key_times": key_times,
+                "values": keys["LINEAR", True],
+                "times": np.array([0.2, 0.5, 1.1]),
+                "interpolation": "LINEAR",
+                "rotation": True,
+            },
+            "between the keys",
+            gradients=("times",),
+        ),
+        Case(
+            "animation.skeleton.sample_clip",
+            {"clip": _clip(key_times, keys), "skeleton": _skeleton_record(), "times": times},
+        ),
+        Case("animation.skeleton.local_matrices", {"pose": _pose(2)}),
+        Case("animation.skeleton.global_matrices", {"pose": _pose(2), "parents": _PARENTS}),
+    ]
+
+
+def _skeleton_record() -> Record:
+    names = tuple(f"joint {i}" for i in range(len(_PARENTS)))
+    fields = {"names": names, "parents": _PARENTS, "rest": _pose()}
+    return Record("animation.skeleton.Skeleton", fields)
+
+
+def _clip(key_times: np.ndarray, keys: dict) -> Record:
+    moves = [
+        (1, "rotation", "LINEAR", keys["LINEAR", True]),
+        (2, "translation", "LINEAR", keys["LINEAR", False]),
+        (2, "rotation", "CUBICSPLINE", keys["CUBICSPLINE", True]),
+        (4, "scale", "STEP", keys["STEP", False]),
+        (5, "translation", "CUBICSPLINE", keys["CUBICSPLINE", False]),
+    ]
+    channels = tuple(
+        Record(
+            "animation.skeleton.Channel",
+            {"joint": j, "path": p, "interpolation": i, "times": key_times, "values": v},
+            host=True,
+        )
+        for j, p, i, v in moves
+    )
+    fields = {"name": "test", "channels": channels, "start": 0.0, "duration": 1.3}
+    return Record("animation.skeleton.Clip", fields, host=True)
+
+
+def _skinning() -> list[Case]:
+    v, k, p, j = 6, 3, 4, 5
+    weights = _uniform(0, 1, v, k)
+    weights[0] = [1, 0, 0]
+    inverse_binds, matrices = (np.tile(np.eye(4), (*lead, 1, 1)) for lead in ((p,), (2, j)))
+    inverse_binds[..., :3, :], matrices[..., :3, :] = _normal(p, 3, 4), _normal(2, j, 3, 4)
+    skin = Record(
+        "animation.skinning.Skin",
+        {
+            "vertices": _normal(v, 3),
+            "normals": _unit(v),
+            "joint_indices": _rng.integers(0, p, size=(v, k)).astype(np.int32),
+            "weights": weights / weights.sum(-1, keepdims=True),
+            "palette_joints": _rng.integers(0, j, size=p).astype(np.int32),
+            "inverse_binds": inverse_binds,
+        },
+    )
+    linear = _normal(7, 3, 3)
+    linear[0] = np.diag([2.0, 1.0, -1.0])
+    linear[1] = np.diag([1.0, 1.0, 0.0])
+    return [
+        Case(
+            "animation.skinning.skinning_matrices",
+            {"skin": skin, "globals": matrices},
+            gradients=("globals",),
+        ),
+        Case(
+            "animation.skinning.transform_normals",
+            {"linear": linear, "normals": _unit(7)},
+            gradients=("linear", "normals"),
+            on={"normals": "sphere"},
+        ),
+        Case(
+            "animation.skinning.skin_mesh",
+            {"skin": skin, "globals": matrices},
+            gradients=("globals",),
+        ),
+    ]
+
+
+CASES: tuple[Case, ...] = tuple(
+    case
+    for room in (
+        _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility, _skeleton,
+        _skinning,
+    )
+    for case in room()
+)  # fmt: skip

@@ -1,0 +1,138 @@
+"""The two packages have the same public functions and records, and every kernel has a case."""
+
+import dataclasses
+import importlib
+import inspect
+import pathlib
+import types
+import typing
+from typing import Any
+
+import pytest
+
+from tests.twins.agreement import kernels_with_a_case
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+
+# What of jaxrender has a partner in torchref: whole rooms, and single modules. The rest of `animation` builds
+# the data of the built-in body.
+PAIRED = ("vecmath", "harmonics.", "animation.skeleton", "animation.skinning")
+UNPAIRED_MODULES = {"harmonics.pipeline": "the order of the stages, no arithmetic"}
+
+# Public names without a partner, or with another signature.
+EXCEPTIONS = {
+    "vecmath.constant_like": "writes out broadcasts, which torch does by itself",
+    "harmonics.sh.order_of": "a detail of how jaxrender reads an array's shape",
+    "harmonics.sh.bands": "a table of jaxrender's own method",
+    "harmonics.sh.basis_columns": "the recurrence behind sh_basis; the twin has none",
+    "harmonics.sh.rotation_table": "a table of jaxrender's own method; the twin rotates by projection",
+    "harmonics.sh.sphere_quadrature": "torchref keeps its rules in a private file",
+    "harmonics.zh_fit.greedy_axes": "where jaxrender starts its search; the twin starts from a grid",
+    "harmonics.zh_fit.DAMPING": "the twin cuts singular values",
+    "harmonics.sh.triple_product_tensor": "torchref's way to the product",
+    "harmonics.zh.zonal_integral": "torchref integrates where jaxrender has closed forms",
+}
+
+# Kernels with a partner that test_harmonics.py compares in a test of their own.
+COMPARED_APART = {
+    "harmonics.zh_fit.fit_zh_lobes": "the search of each side ends at its own digits: judged by error",
+    "harmonics.zh_fit.fit_shared_axes": "the same",
+}
+
+
+def modules() -> list[str]:
+    """Dotted names, without the package, of the modules that have a partner."""
+    found = []
+    for path in sorted((ROOT / "jaxrender").rglob("*.py")):
+        name = ".".join(path.relative_to(ROOT / "jaxrender").with_suffix("").parts)
+        if name.startswith(PAIRED) and not name.endswith("__init__") and name not in UNPAIRED_MODULES:
+            found.append(name)
+    return found
+
+
+def public_names(package: str, module: str) -> dict[str, Any]:
+    """Functions and records that a module defines, by their full name without the package."""
+    loaded = importlib.import_module(f"{package}.{module}")
+    return {
+        f"{module}.{name}": value
+        for name, value in vars(loaded).items()
+        if not name.startswith("_")
+        and (inspect.isfunction(value) or inspect.isclass(value))
+        and value.__module__ == loaded.__name__
+        and f"{module}.{name}" not in EXCEPTIONS
+    }
+
+
+def pairs() -> list[str]:
+    return [name for module in modules() for name in public_names("jaxrender", module)]
+
+
+def spelled(annotation: Any) -> str:
+    """An annotation without its package: dtype and axes of arrays, names of the rest."""
+    if hasattr(annotation, "dim_str"):
+        return f"{annotation.dtype.__name__}[{annotation.dim_str}]"
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return " | ".join(sorted(spelled(x) for x in typing.get_args(annotation)))
+    if isinstance(annotation, list):
+        return f"[{', '.join(spelled(x) for x in annotation)}]"
+    if typing.get_args(annotation):
+        inside = ", ".join(spelled(x) for x in typing.get_args(annotation))
+        return f"{spelled(typing.get_origin(annotation))}[{inside}]"
+    if inspect.isclass(annotation):
+        array = annotation.__module__.startswith(("jax", "torch", "numpy")) and annotation.__name__ in (
+            "Array",
+            "ndarray",
+            "Tensor",
+        )
+        return "array" if array else annotation.__name__
+    return repr(annotation)
+
+
+@pytest.mark.parametrize("module", modules())
+def test_modules_offer_the_same_names(module):
+    ours, theirs = (set(public_names(package, module)) for package in ("jaxrender", "torchref"))
+    assert ours == theirs, f"only in jaxrender: {ours - theirs}, only in torchref: {theirs - ours}"
+
+
+def test_torchref_has_no_module_of_its_own():
+    for path in sorted((ROOT / "torchref").rglob("*.py")):
+        partner = ROOT / "jaxrender" / path.relative_to(ROOT / "torchref")
+        assert path.name.startswith("_") or partner.exists(), path
+
+
+@pytest.mark.parametrize("name", pairs())
+def test_signature(name):
+    module = name.rpartition(".")[0]
+    ours, theirs = (public_names(package, module).get(name) for package in ("jaxrender", "torchref"))
+    assert theirs is not None, f"torchref lacks {name}"
+    if dataclasses.is_dataclass(ours):
+        fields = [[(f.name, spelled(f.type)) for f in dataclasses.fields(x)] for x in (ours, theirs)]
+        assert fields[0] == fields[1]
+        assert ours.__dataclass_params__.frozen and theirs.__dataclass_params__.frozen
+        return
+    signatures = [inspect.signature(x) for x in (ours, theirs)]
+    parameters = [
+        [(p.name, p.kind.name, p.default, spelled(p.annotation)) for p in s.parameters.values()]
+        for s in signatures
+    ]
+    assert parameters[0] == parameters[1]
+    assert spelled(signatures[0].return_annotation) == spelled(signatures[1].return_annotation)
+
+
+def test_every_kernel_has_a_case():
+    kernels = {
+        name
+        for module in modules()
+        for name, value in public_names("jaxrender", module).items()
+        if inspect.isfunction(value)
+    }
+    missing = kernels - kernels_with_a_case() - set(COMPARED_APART)
+    assert not missing, f"add a case to tests/support/cases.py for {sorted(missing)}"
+
+
+def test_the_lists_of_exceptions_are_alive():
+    """An exception whose name is gone from both packages is dropped from the list."""
+    for name in [*EXCEPTIONS, *COMPARED_APART]:
+        module, _, attribute = name.rpartition(".")
+        loaded = [importlib.import_module(f"{package}.{module}") for package in ("jaxrender", "torchref")]
+        assert any(hasattr(x, attribute) for x in loaded), name
