@@ -38,9 +38,9 @@ class Body:
     def resolved_by(self, step: float) -> "Body":
         """The body as thick and as blunt as a grid of that spacing can show.
 
-        A grid finds a part that is thicker than a diagonal of its cells, 0.87 steps each way, and follows the
-        edge of a flat part of radius r and stretch s, where the surface curves by s / r, up to about 5 / (3 step). What
-        is made thicker keeps its width.
+        A grid finds a part that is thicker than the diagonal of a cell, 0.87 steps each way, and follows the
+        edge of a flat part, where a radius r under a stretch s curves by s / r, up to about 5 / 3 per step.
+        What is made thicker keeps its width.
         """
         radius = np.maximum(self.radius, 0.9 * step)
         stretch = np.clip(self.stretch * self.radius / radius, 1.0, radius / (0.6 * step))
@@ -209,18 +209,17 @@ def mesh_body(
         num_splits += 1
     # Splitting each triangle in four makes 4 n - 6 vertices of n on a surface without holes.
     wanted = num_vertices / 4**num_splits
-    best = None
     # The first, coarse mesh only measures the area.
     step *= 2.0 ** (num_splits + 1)
+    meshes = []
     for _ in range(8):
         thick = body.resolved_by(step)
-        vertices, faces = _march(thick, step)
-        if best is None or abs(len(vertices) - wanted) < abs(len(best[0]) - wanted):
-            best = vertices, faces, thick
-        if abs(len(vertices) / wanted - 1.0) < 0.04:
+        meshes.append((*_march(thick, step), thick))
+        share = len(meshes[-1][0]) / wanted
+        if abs(share - 1.0) < 0.04:
             break
-        step *= float(np.sqrt(len(vertices) / wanted))
-    vertices, faces, thick = best
+        step *= float(np.sqrt(share))
+    vertices, faces, thick = min(meshes, key=lambda mesh: abs(len(mesh[0]) - wanted))
     for _ in range(num_splits):
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)
     return _relax(thick, vertices, faces), faces, thick

@@ -1,7 +1,7 @@
 """The built-in human: a skeleton of 25 joints, 1.75 m tall, and three procedural motions.
 
-Every joint's frame at rest is the world's: x to the left of the body, y up, z ahead. All of it is computed from
-the numbers in this file, so it is the same on every machine up to rounding. NumPy; metres, seconds.
+Every joint's frame at rest is the world's: x to the left of the body, y up, z ahead. All is computed from the
+numbers in this file, so it is the same on every machine up to rounding. NumPy; metres, seconds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from jaxrender.animation.skeleton import Channel, Clip, Pose, Skeleton
@@ -80,8 +80,9 @@ _STRIKE = 0.25  # how far ahead of the hips the ankle is when the heel strikes
 # The foot turns about the heel until it is flat, and about the ball when the heel rises. Share of the cycle
 # since the heel struck; degrees, positive with the toes down. After Perry, "Gait Analysis", 1992, chapter 3.
 _FOOT_PITCH = np.array(
-    [[0, -18], [0.1, 0], [0.36, 0], [0.48, 14], [0.62, 46], [0.7, 44], [0.82, 8], [0.92, -16], [1, -18]]
+    [[0, -18], [0.1, 0], [0.36, 0], [0.48, 14], [0.62, 46], [0.7, 44], [0.82, 8], [0.92, -16]]
 )
+_HEEL, _BALL = -0.045, 0.125  # ahead of the ankle, on the ground
 
 
 def _walk() -> Clip:
@@ -110,33 +111,36 @@ def _walk() -> Clip:
     return _clip("walk", times, hips, turns, ankles, feet)
 
 
+def _foot_pitch(phase: np.ndarray) -> np.ndarray:
+    """Radians; monotone between its keys, so that a flat foot stays flat."""
+    knots = np.concatenate([_FOOT_PITCH + [shift, 0.0] for shift in (-1.0, 0.0, 1.0)])
+    return np.radians(PchipInterpolator(knots[:, 0], knots[:, 1])(phase))
+
+
+def _planted(phase: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """The ankle of a foot on the ground: it turns about heel or ball, and that slides back with the ground."""
+    pitch = _foot_pitch(phase)
+    pivot = np.where(pitch < 0, _HEEL, _BALL)
+    y = rest[1] * np.cos(pitch) + pivot * np.sin(pitch)
+    z = pivot - pivot * np.cos(pitch) + rest[1] * np.sin(pitch)
+    return np.stack([np.full_like(phase, rest[0]), y, _STRIKE - _SPEED * _CYCLE * phase + z], axis=-1)
+
+
 def _step(phase: np.ndarray, side: str) -> tuple[np.ndarray, Rotation, Rotation]:
     """Ankle, turn of the foot and of the toes at each phase since the heel struck."""
-    pitch = CubicSpline(_FOOT_PITCH[:, 0], _FOOT_PITCH[:, 1], bc_type="periodic")(phase)
     rest = _place(f"{side}Foot")
-
-    def planted(p: np.ndarray) -> np.ndarray:
-        turn = np.radians(CubicSpline(_FOOT_PITCH[:, 0], _FOOT_PITCH[:, 1], bc_type="periodic")(p))
-        pivot = np.where(turn < 0, _HEEL, _BALL)
-        # The ankle turns about the pivot, and the pivot slides back with the ground.
-        y = rest[1] * np.cos(turn) + pivot * np.sin(turn)
-        z = pivot - pivot * np.cos(turn) + rest[1] * np.sin(turn)
-        return np.stack([np.full_like(p, rest[0]), y, _STRIKE - _SPEED * _CYCLE * p + z], axis=-1)
-
-    # Off the ground a smooth curve leads from toe-off over the knee's bend to the next strike.
+    # Off the ground a smooth curve leads from the lift of the toes through two places to the next strike.
     stance = np.linspace(0.0, _STANCE, 32)
-    swing = np.array([0.74, 0.87])
-    knots = np.concatenate([stance, swing, [1.0]])
-    over = np.array([[rest[0], 0.215, -0.16], [rest[0], 0.135, 0.20]])
-    curve = CubicSpline(
-        knots, np.concatenate([planted(stance), over, planted(np.zeros(1))]), bc_type="periodic"
-    )
-    ankle = np.where((phase < _STANCE)[:, None], planted(phase), curve(phase))
-    bent = np.where(phase < _STANCE, np.maximum(pitch, 0.0), 46.0 * np.exp(-((phase - _STANCE) / 0.06)))
+    air = np.array([[rest[0], 0.215, -0.16], [rest[0], 0.135, 0.20]])
+    knots = np.concatenate([stance, [0.74, 0.87, 1.0]])
+    places = np.concatenate([_planted(stance, rest), air, _planted(np.zeros(1), rest)])
+    swing = CubicSpline(knots, places, bc_type="periodic")(phase)
+    on_ground = phase < _STANCE
+    ankle = np.where(on_ground[:, None], _planted(phase, rest), swing)
+    pitch = np.degrees(_foot_pitch(phase))
+    # The toes stay on the ground while the heel rises, and straighten soon after.
+    bent = np.where(on_ground, np.maximum(pitch, 0.0), 46.0 * np.exp(-(phase - _STANCE) / 0.06))
     return ankle, _degrees(pitch, 0.0, 0.0), _degrees(-0.85 * bent, 0.0, 0.0)
-
-
-_HEEL, _BALL = -0.045, 0.125  # ahead of the ankle, on the ground
 
 
 # Standing.
@@ -158,14 +162,12 @@ def _turn() -> Clip:
         "Neck": turned(20.0),
         "Head": turned(32.0, (0, 8, 0, -10, 0), roll=4.0),
     }
-    wide, near = np.array([12, 55, 14, 12, 12]), np.array([20, 35, 15, 80, 20])
-    for side, order in (("Left", slice(None)), ("Right", [0, 3, 2, 1, 4])):
-        sign = 1.0 if side == "Left" else -1.0
-        outward, bend = wide[order], near[order]
-        ahead = np.array([0, 5, 0, 50, 0])[order]
-        directions = _directions(sign, outward, ahead)
-        turns[f"{side}Arm"] = _keyed(times, keys, _aimed(side, directions))
-        turns[f"{side}ForeArm"] = _keyed(times, keys, _elbow(side, bend.astype(float)))
+    # Of the arm on the side looked to, and of the other: outward, ahead, bend of the elbow, in degrees.
+    neutral, near, far = (12, 0, 20), (55, 5, 35), (12, 50, 80)
+    for side, order in (("Left", (near, far)), ("Right", (far, near))):
+        outward, ahead, bend = np.array([neutral, order[0], neutral, order[1], neutral], dtype=np.float64).T
+        turns[f"{side}Arm"] = _keyed(times, keys, _aimed(side, outward, ahead))
+        turns[f"{side}ForeArm"] = _keyed(times, keys, _elbow(side, bend))
     hips = CubicSpline(
         keys,
         np.array([[0, -0.012, 0], [0.03, -0.02, 0], [0, -0.012, 0], [-0.03, -0.02, 0], [0, -0.012, 0]]),
@@ -190,14 +192,13 @@ def _reach() -> Clip:
         "Neck": bent((-4, 0), (-8, 0), (0, -4), (-16, 0)),
         "Head": bent((-6, 0), (-14, 0), (6, -8), (-18, 0)),
     }
-    # Outward from straight down, and ahead, in degrees; across the body is inward while ahead.
+    # Outward, ahead and bend of the elbow in degrees; across the body is inward while ahead.
     arms = {
         "Left": ([12, 6, 20, -30, 8, 12], [0, 84, 160, 72, 70, 0], [18, 10, 12, 40, 14, 18]),
         "Right": ([12, 6, 20, 14, 8, 12], [0, 84, 160, 30, 70, 0], [18, 10, 12, 60, 14, 18]),
     }
     for side, (outward, ahead, bend) in arms.items():
-        directions = _directions(1.0 if side == "Left" else -1.0, np.asarray(outward), np.asarray(ahead))
-        turns[f"{side}Arm"] = _keyed(times, keys, _aimed(side, directions))
+        turns[f"{side}Arm"] = _keyed(times, keys, _aimed(side, np.asarray(outward), np.asarray(ahead)))
         turns[f"{side}ForeArm"] = _keyed(times, keys, _elbow(side, np.asarray(bend, dtype=np.float64)))
     lowered = np.array(
         [[0, -0.012, 0], [0, -0.02, -0.02], [0, -0.006, 0.01], [0.02, -0.03, 0], [0, -0.33, -0.14]]
@@ -228,7 +229,10 @@ def _degrees(x, y, z) -> Rotation:
 
 
 def _keyed(times: np.ndarray, keys: np.ndarray, rotations: Rotation) -> Rotation:
-    return RotationSpline(keys, rotations)(times)
+    """A smooth closed curve through rotations, of which the last is the first again."""
+    period = keys[-1] - keys[0]
+    around = np.concatenate([keys[:-1] - period, keys[:-1], keys + period])
+    return RotationSpline(around, Rotation.concatenate([rotations[:-1], rotations[:-1], rotations]))(times)
 
 
 def _lowered(side: str, degrees: float) -> Rotation:
@@ -236,19 +240,16 @@ def _lowered(side: str, degrees: float) -> Rotation:
     return Rotation.from_euler("z", -degrees if side == "Left" else degrees, degrees=True)
 
 
-def _directions(sign: float, outward: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Unit vectors: from straight down, raised ahead and then outward by these degrees."""
+def _aimed(side: str, outward: np.ndarray, ahead: np.ndarray) -> Rotation:
+    """The least turns of an arm that raise it ahead from straight down, then outward, by these degrees."""
     up, out = np.radians(ahead), np.radians(outward)
-    return np.stack([sign * np.sin(out), -np.cos(out) * np.cos(up), np.cos(out) * np.sin(up)], axis=-1)
-
-
-def _aimed(side: str, directions: np.ndarray) -> Rotation:
-    """The least turn of the arm that points it along each direction."""
+    across = np.sin(out) if side == "Left" else -np.sin(out)
+    aim = np.stack([across, -np.cos(out) * np.cos(up), np.cos(out) * np.sin(up)], axis=-1)
     arm = _place(f"{side}ForeArm") - _place(f"{side}Arm")
-    arm = np.broadcast_to(arm / np.linalg.norm(arm), directions.shape)
-    axis = np.cross(arm, directions)
+    arm = np.broadcast_to(arm / np.linalg.norm(arm), aim.shape)
+    axis = np.cross(arm, aim)
     sine = np.linalg.norm(axis, axis=-1, keepdims=True)
-    angle = np.arctan2(sine, np.sum(arm * directions, axis=-1, keepdims=True))
+    angle = np.arctan2(sine, np.sum(arm * aim, axis=-1, keepdims=True))
     return Rotation.from_rotvec(axis / np.maximum(sine, 1e-12) * angle)
 
 

@@ -6,11 +6,13 @@ and whatever is wrong is one `InputError` with the number of its line.
 """
 
 import hashlib
+import io
 import re
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NoReturn
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,12 +28,12 @@ STATURE = 1.7
 """Metres: what a skeleton of unknown unit is scaled to."""
 
 MAX_BYTES = 1 << 28
-"""A file of 256 MB is about 25 minutes of a 100-joint skeleton at 120 frames a second."""
+"""256 MB are about a quarter of an hour of 100 joints at 120 frames a second."""
 
 MAX_JOINTS = 2000
 
+_FARTHEST = 1e6
 _CHANNEL = re.compile(r"([xyz])(position|rotation)", re.IGNORECASE)
-_AXES = {"x": 0, "y": 1, "z": 2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,45 +101,44 @@ def parse_bvh(
     lines = _Lines(path, content)
     joints = _hierarchy(lines)
     frame_time, values = _motion(lines, sum(len(joint.channels) for joint in joints))
+    rotations, positions = _tracks(joints, values)
 
     notes: list[str] = []
-    rotations, positions = _tracks(joints, values)
     if skip_calibration is None:
         skip_calibration = _starts_with_calibration(rotations)
-        if skip_calibration:
-            notes.append("frame 0 is a calibration pose and was skipped")
     if skip_calibration and len(values) > 1:
-        rotations = {joint: q[1:] for joint, q in rotations.items()}
-        positions = {joint: p[1:] for joint, p in positions.items()}
-
-    parents = tuple(joint.parent for joint in joints)
-    offsets = np.asarray([joint.offset for joint in joints])
+        notes.append("frame 0, a calibration pose, was skipped")
+        rotations = {joint: track[1:] for joint, track in rotations.items()}
+        positions = {joint: track[1:] for joint, track in positions.items()}
+        values = values[1:]
     names = _unique([joint.name for joint in joints], notes)
+    parents = tuple(joint.parent for joint in joints)
+    offsets = np.stack([joint.offset for joint in joints])
     scale = metres_per_unit
     if scale is None:
         scale, reason = _guess_scale(names, parents, offsets)
         notes.append(f"unit taken as {scale:.4g} m: {reason}")
-    largest = max([np.abs(offsets).max(), *(np.abs(p).max() for p in positions.values())])
-    if not largest * scale < 1e6:
-        bad_input(path, "positions", expected="coordinates below 1e6 m", got=f"{largest * scale:.3g} m")
+    farthest = scale * max(np.abs(track).max() for track in (offsets, *positions.values()))
+    if not farthest < _FARTHEST:
+        bad_input(path, "positions", expected=f"coordinates below {_FARTHEST:g} m", got=f"{farthest:.3g} m")
 
-    num_frames = len(values) - (1 if skip_calibration and len(values) > 1 else 0)
-    times = np.arange(num_frames) * frame_time
-    channels = [
-        Channel(joint, "rotation", "LINEAR", _f32(times), _f32(_sign_continuous(q)))
-        for joint, q in rotations.items()
-    ] + [
-        Channel(joint, "translation", "LINEAR", _f32(times), _f32(p * scale))
-        for joint, p in positions.items()
+    times = _float32(np.arange(len(values)) * frame_time)
+    turning = [
+        Channel(joint, "rotation", "LINEAR", times, _float32(_sign_continuous(track)))
+        for joint, track in rotations.items()
+    ]
+    moving = [
+        Channel(joint, "translation", "LINEAR", times, _float32(scale * track))
+        for joint, track in positions.items()
     ]
     rest = Pose(
-        translation=jnp.asarray(offsets * scale, dtype=jnp.float32),
+        translation=jnp.asarray(scale * offsets, dtype=jnp.float32),
         rotation=jnp.tile(jnp.asarray([0, 0, 0, 1], dtype=jnp.float32), (len(joints), 1)),
         scale=jnp.ones((len(joints), 3), dtype=jnp.float32),
     )
     return BvhMotion(
         skeleton=Skeleton(names, parents, rest),
-        clip=Clip(path.stem, tuple(channels), 0.0, float(times[-1])),
+        clip=Clip(path.stem, (*turning, *moving), 0.0, float(times[-1])),
         unit_scale=float(scale),
         content_hash=hashlib.sha256(content).hexdigest(),
         notes=tuple(notes),
@@ -152,7 +153,7 @@ def _read_bytes(path: Path) -> bytes:
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            bad_input(path, "file", expected="a regular file", got="a folder or a device")
+            bad_input(path, "file", expected="a regular file", got="a folder, pipe or device")
         if status.st_size > MAX_BYTES:
             bad_input(path, "file", expected=f"at most {MAX_BYTES} bytes", got=status.st_size)
         with path.open("rb") as file:
@@ -162,21 +163,21 @@ def _read_bytes(path: Path) -> bytes:
 
 
 class _Lines:
-    """The lines of a file that are not blank, as words, with the number of the line last handed out."""
+    """The lines of a file that are not blank, as words, and the number of the one last handed out."""
 
     def __init__(self, path: Path, content: bytes):
         try:
-            text = content.decode("utf-8-sig")
+            content.decode("utf-8-sig")
         except UnicodeDecodeError as error:
             line = content.count(b"\n", 0, error.start) + 1
             bad_input(f"{path}:{line}", "text", expected="UTF-8", got=f"byte 0x{content[error.start]:02x}")
         self.path = path
         self.num_bytes = len(content)
         self.number = 0
-        self._rest = iter(text.split("\n"))
+        self._text = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig")
 
     def __iter__(self) -> Iterator[list[str]]:
-        for line in self._rest:
+        for line in self._text:
             self.number += 1
             if words := line.split():
                 yield words
@@ -187,29 +188,28 @@ class _Lines:
             return words
         self.fail("end of file", expected=expected, got="no more lines")
 
-    def fail(self, what: str, *, expected: object, got: object):
+    def fail(self, what: str, *, expected: object, got: object) -> NoReturn:
         bad_input(f"{self.path}:{self.number}", what, expected=expected, got=got)
 
-    def numbers(self, words: list[str], what: str, count: int) -> np.ndarray:
+    def numbers(self, words: list[str], what: str, count: int) -> Float[np.ndarray, " n"]:
         """`count` finite numbers."""
         if len(words) != count:
             self.fail(what, expected=f"{count} numbers", got=len(words))
-        try:
-            values = np.array([float(word) for word in words])
-        except ValueError:
-            word = next(word for word in words if not _is_number(word))
-            self.fail(what, expected="numbers", got=repr(word[:40]))
+        values = np.empty(count)
+        for i, word in enumerate(words):
+            try:
+                values[i] = float(word)
+            except ValueError:
+                self.fail(what, expected="a number", got=_short(word))
         if not np.isfinite(values).all():
             self.fail(what, expected="finite numbers", got=words[int(np.argmin(np.isfinite(values)))])
         return values
 
 
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+def _short(*words: str) -> str:
+    """Words of a file for a message: quoted, and not endless."""
+    text = " ".join(words)
+    return repr(text if len(text) <= 60 else text[:57] + "...")
 
 
 # The hierarchy.
@@ -219,15 +219,65 @@ def _is_number(word: str) -> bool:
 class _Joint:
     name: str
     parent: int
-    line: int
-    offset: np.ndarray | None = None
-    channels: list[tuple[str, int]] | None = None
-    end_site: bool = False
-    children: int = field(default=0)
+    end_site: bool
+    has_offset: bool = False
+    has_channels: bool = False
+    offset: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    channels: list[tuple[str, int]] = field(default_factory=list)
+
+
+def _hierarchy(lines: _Lines) -> list[_Joint]:
+    """Every joint, parents first, up to the line MOTION. An explicit stack stands for the nesting."""
+    if (words := lines.next("HIERARCHY"))[0].upper() != "HIERARCHY":
+        lines.fail("first line", expected="HIERARCHY", got=_short(*words))
+    joints: list[_Joint] = []
+    nesting: list[int] = []
+    opening = False  # a joint waits for its {
+    for words in _statements(lines):
+        key = words[0].upper()
+        if opening != (key == "{"):
+            expected = f"{{ of {joints[-1].name}" if opening else "a joint before {"
+            lines.fail("hierarchy", expected=expected, got=_short(*words))
+        if key == "{":
+            nesting.append(len(joints) - 1)
+            opening = False
+        elif key == "MOTION" and not nesting:
+            break
+        elif key == "ROOT" and not joints:
+            joints.append(_Joint(" ".join(words[1:]) or "root", -1, end_site=False))
+            opening = True
+        elif key in ("ROOT", "JOINT", "END", "OFFSET", "CHANNELS", "}") and nesting:
+            inside = joints[nesting[-1]]
+            if key == "OFFSET" and not inside.has_offset:
+                inside.offset, inside.has_offset = (
+                    lines.numbers(words[1:], f"OFFSET of {inside.name}", 3),
+                    True,
+                )
+            elif key == "CHANNELS" and not (inside.has_channels or inside.end_site):
+                inside.channels, inside.has_channels = _channels(lines, words, inside.name), True
+            elif key == "}" and inside.has_offset:
+                nesting.pop()
+            elif key in ("JOINT", "END") and inside.has_offset and not inside.end_site:
+                if len(joints) == MAX_JOINTS:
+                    lines.fail("hierarchy", expected=f"at most {MAX_JOINTS} joints", got="more")
+                name = f"{inside.name} End Site" if key == "END" else " ".join(words[1:])
+                joints.append(_Joint(name or f"joint {len(joints)}", nesting[-1], end_site=key == "END"))
+                opening = True
+            else:
+                rule = "one OFFSET, then at most one CHANNELS and joints, and neither of these in an End Site"
+                lines.fail(f"joint {inside.name}", expected=rule, got=_short(*words))
+        else:
+            rule = "one ROOT, with joints, OFFSET and CHANNELS inside, closed by as many } as {"
+            lines.fail("hierarchy", expected=rule, got=_short(*words))
+    else:
+        lines.fail("end of file", expected="MOTION after a closed hierarchy", got="no more lines")
+    if not joints:
+        lines.fail("hierarchy", expected="a ROOT", got="none")
+    return joints
 
 
 def _statements(lines: _Lines) -> Iterator[list[str]]:
-    """Lines as words, with each brace on its own: files put it behind a name, or on the next line."""
+    """Lines as words, with each brace on its own: some files put it behind the name."""
     for words in lines:
         statement: list[str] = []
         for word in words:
@@ -242,105 +292,36 @@ def _statements(lines: _Lines) -> Iterator[list[str]]:
             yield statement
 
 
-def _hierarchy(lines: _Lines) -> list[_Joint]:
-    """Every joint, parents first, up to the line MOTION. An explicit stack stands for the nesting."""
-    if (words := lines.next("HIERARCHY"))[0].upper() != "HIERARCHY":
-        lines.fail("first line", expected="HIERARCHY", got=repr(" ".join(words)[:40]))
-    joints: list[_Joint] = []
-    open_joints: list[int] = []
-    waiting_for_brace = False
-    for words in _statements(lines):
-        key = words[0].upper()
-        current = joints[open_joints[-1]] if open_joints else None
-        if waiting_for_brace and key != "{":
-            lines.fail(f"joint {joints[-1].name}", expected="{", got=repr(words[0][:40]))
-        if key == "{":
-            if not waiting_for_brace:
-                lines.fail("hierarchy", expected="a joint before its {", got="{")
-            waiting_for_brace = False
-            open_joints.append(len(joints) - 1)
-        elif key == "}":
-            if current is None:
-                lines.fail("hierarchy", expected="as many { as }", got="one } too many")
-            if current.offset is None:
-                lines.fail(f"joint {current.name}", expected="an OFFSET", got="none before }")
-            open_joints.pop()
-        elif key in ("ROOT", "JOINT", "END"):
-            _check_opening(lines, key, current, len(joints))
-            parent = open_joints[-1] if open_joints else -1
-            name = f"{joints[parent].name} End Site" if key == "END" else " ".join(words[1:])
-            joints.append(_Joint(name or f"joint {len(joints)}", parent, lines.number, end_site=key == "END"))
-            waiting_for_brace = True
-        elif key == "OFFSET" and current is not None:
-            if current.offset is not None:
-                lines.fail(f"joint {current.name}", expected="one OFFSET", got="a second one")
-            current.offset = lines.numbers(words[1:], f"OFFSET of {current.name}", 3)
-        elif key == "CHANNELS" and current is not None:
-            if current.channels is not None or current.end_site:
-                lines.fail(
-                    f"joint {current.name}", expected="at most one CHANNELS, none in an End Site", got=key
-                )
-            current.channels = _channels(lines, words, current.name)
-        elif key == "MOTION" and not open_joints:
-            break
-        else:
-            lines.fail(
-                "hierarchy", expected="ROOT, JOINT, End Site, OFFSET, CHANNELS or }", got=repr(words[0][:40])
-            )
-    else:
-        lines.fail("end of file", expected="MOTION", got="no more lines")
-    if not joints:
-        lines.fail("hierarchy", expected="a ROOT", got="none")
-    for joint in joints:
-        joint.channels = joint.channels or []
-    return joints
-
-
-def _check_opening(lines: _Lines, key: str, current: _Joint | None, num_joints: int) -> None:
-    """ROOT stands outside of every joint, and only once; JOINT and End Site stand inside of one."""
-    if key == "ROOT" and num_joints:
-        lines.fail("hierarchy", expected="one ROOT", got="a second one")
-    if (key == "ROOT") != (current is None):
-        lines.fail("hierarchy", expected="JOINT or End Site inside of ROOT", got=key)
-    if current is not None and current.end_site:
-        lines.fail("hierarchy", expected="nothing but an OFFSET in an End Site", got=key)
-    if current is not None and current.offset is None:
-        lines.fail(f"joint {current.name}", expected="an OFFSET before its children", got=key)
-    if num_joints >= MAX_JOINTS:
-        lines.fail("hierarchy", expected=f"at most {MAX_JOINTS} joints", got="more")
-
-
 def _channels(lines: _Lines, words: list[str], name: str) -> list[tuple[str, int]]:
     """("position" or "rotation", axis) in the order of the file."""
-    if len(words) < 2 or not words[1].isdecimal() or int(words[1][:4]) != len(words) - 2:
-        lines.fail(
-            f"CHANNELS of {name}", expected="their number, then as many names", got=" ".join(words)[:60]
-        )
+    if len(words) < 2 or words[1] != str(len(words) - 2):
+        lines.fail(f"CHANNELS of {name}", expected="their number and as many names", got=_short(*words[1:]))
     channels = []
     for word in words[2:]:
         if not (match := _CHANNEL.fullmatch(word)):
-            lines.fail(f"CHANNELS of {name}", expected="X, Y or Z with position or rotation", got=word[:40])
-        channels.append((match[2].lower(), _AXES[match[1].lower()]))
+            lines.fail(f"CHANNELS of {name}", expected="Xposition ... Zrotation", got=_short(word))
+        channels.append((match[2].lower(), "xyz".index(match[1].lower())))
     moved = [axis for kind, axis in channels if kind == "position"]
     if len(set(moved)) < len(moved):
-        lines.fail(f"CHANNELS of {name}", expected="each position once", got=" ".join(words[2:])[:60])
+        lines.fail(f"CHANNELS of {name}", expected="each position once", got=_short(*words[2:]))
     return channels
 
 
 def _unique(names: list[str], notes: list[str]) -> tuple[str, ...]:
-    """Names with a number behind each repeated one."""
+    """Names with a number behind each one that came before."""
     taken = set(names)
+    result: list[str] = []
     seen: set[str] = set()
-    result = []
+    repeats: dict[str, int] = {}
     for name in names:
-        new, count = name, 2
+        new = name
         while new in seen or (new != name and new in taken):
-            new, count = f"{name} {count}", count + 1
+            repeats[name] = repeats.get(name, 1) + 1
+            new = f"{name} {repeats[name]}"
         seen.add(new)
         result.append(new)
-    renamed = sum(old != new for old, new in zip(names, result, strict=True))
-    if renamed:
-        notes.append(f"{renamed} joints had a name that was taken and got a number behind it")
+    if repeats:
+        notes.append(f"joints of one name got numbers: {', '.join(sorted(repeats)[:5])}")
     return tuple(result)
 
 
@@ -447,5 +428,5 @@ def _guess_scale(names: tuple[str, ...], parents: tuple[int, ...], offsets: np.n
     return 1.0, "the skeleton has no extent"
 
 
-def _f32(x: np.ndarray) -> np.ndarray:
+def _float32(x: np.ndarray) -> np.ndarray:
     return np.asarray(x, dtype=np.float32)

@@ -45,7 +45,7 @@ def read_gltf(path: str | os.PathLike) -> Character:
         left_out = "; ".join(source.notes) or "no mesh in the scene"
         source.bad("meshes", expected="at least one triangle", got=left_out)
     skeleton, joint_of = build_skeleton(source, graph, palette.nodes)
-    surface = _merged(surfaces)
+    surface = _merged(source, surfaces)
     surface = _oriented(source, surface, graph.world_matrices()[palette.nodes] @ palette.inverse_binds())
     return Character(
         name=printable(source.path.stem),
@@ -82,14 +82,9 @@ class _Palette:
 
     def skin(self, index: Any, where: str) -> tuple[int, int]:
         """The first entry of a skin and the number of its joints."""
-        source, skin = self._source, self._source.item("skins", index, where)
-        field = f"skins[{index}]"
-        if not skin.joints:
-            source.bad(f"{field}.joints", expected="at least one joint", got="none")
-        for node in skin.joints:
-            source.item("nodes", node, f"{field}.joints")
+        skin = self._source.item("skins", index, where)
         if ("skin", index) not in self._first_entry:
-            inverse_binds = _read_inverse_binds(source, skin, f"{field}.inverseBindMatrices")
+            inverse_binds = _read_skin(self._source, skin, f"skins[{index}]")
             self._block(("skin", index), skin.joints, inverse_binds)
         return self._first_entry["skin", index], len(skin.joints)
 
@@ -104,10 +99,15 @@ class _Palette:
         return self._first_entry[key]
 
 
-def _read_inverse_binds(source: Container, skin: Any, where: str) -> np.ndarray:
-    """Inverse bind matrices of a skin's joints; the identity where the file has none."""
-    count = len(skin.joints)
+def _read_skin(source: Container, skin: Any, field: str) -> np.ndarray:
+    """Inverse bind matrices of a skin's joints, which are checked; the identity where the file has none."""
+    count, where = len(skin.joints), f"{field}.inverseBindMatrices"
+    if not skin.joints:
+        source.bad(f"{field}.joints", expected="at least one joint", got="none")
+    for node in skin.joints:
+        source.item("nodes", node, f"{field}.joints")
     if skin.inverseBindMatrices is None:
+        source.spend(16 * count, where)
         return np.broadcast_to(np.eye(4), (count, 4, 4))
     columns = read_floats(source, skin.inverseBindMatrices, ("MAT4",), where)
     if len(columns) < count:
@@ -125,7 +125,7 @@ def _read_instance(source: Container, node_index: int, palette: _Palette) -> lis
     if node.mesh is None:
         return []
     mesh = source.item("meshes", node.mesh, f"nodes[{node_index}].mesh")
-    num_joints = None
+    first = num_joints = None
     if node.skin is not None:
         first, num_joints = palette.skin(node.skin, f"nodes[{node_index}].skin")
     surfaces = []
@@ -133,31 +133,27 @@ def _read_instance(source: Container, node_index: int, palette: _Palette) -> lis
         where = f"meshes[{node.mesh}].primitives[{i}]"
         surface = read_surface(source, primitive, num_joints, where)
         if surface is not None:
-            if num_joints is None:
-                first = palette.rigid(node_index)
-            surfaces.append(replace(surface, joints=surface.joints + first))
+            entry = palette.rigid(node_index) if first is None else first
+            surfaces.append(replace(surface, joints=surface.joints + entry))
     return surfaces
 
 
-def _merged(surfaces: list[Surface]) -> Surface:
-    """One surface of all, with as many influences a vertex as any vertex needs, the largest first."""
+def _merged(source: Container, surfaces: list[Surface]) -> Surface:
+    """One surface of all, with as many influences a vertex as any vertex needs."""
     starts = np.cumsum([0] + [len(surface.vertices) for surface in surfaces])
     width = max(surface.weights.shape[1] for surface in surfaces)
+    source.spend(2 * width * int(starts[-1]), "meshes")
 
     def padded(values: np.ndarray) -> np.ndarray:
         return np.pad(values, ((0, 0), (0, width - values.shape[1])))
 
-    joints = np.concatenate([padded(surface.joints) for surface in surfaces])
-    weights = np.concatenate([padded(surface.weights) for surface in surfaces])
-    largest_first = np.argsort(-weights, axis=1, kind="stable")
-    used = max(int((weights > 0).sum(axis=1).max()), 1)
     return Surface(
         vertices=np.concatenate([surface.vertices for surface in surfaces]),
         normals=np.concatenate([surface.normals for surface in surfaces]),
         faces=np.concatenate([s.faces + start for s, start in zip(surfaces, starts, strict=False)]),
         albedo=np.concatenate([surface.albedo for surface in surfaces]),
-        joints=np.take_along_axis(joints, largest_first, axis=1)[:, :used],
-        weights=np.take_along_axis(weights, largest_first, axis=1)[:, :used],
+        joints=np.concatenate([padded(surface.joints) for surface in surfaces]),
+        weights=np.concatenate([padded(surface.weights) for surface in surfaces]),
     )
 
 

@@ -18,7 +18,7 @@ def read_clips(source: Container, joint_of: dict[int, int]) -> tuple[Clip, ...]:
     Args:
       joint_of: from node to joint, for the nodes in the skeleton.
     """
-    clips: list[Clip] = []
+    clips: dict[str, Clip] = {}
     for i, animation in enumerate(source.gltf.animations):
         channels = tuple(_read_channels(source, animation, joint_of, f"animations[{i}]"))
         if not channels:
@@ -27,10 +27,10 @@ def read_clips(source: Container, joint_of: dict[int, int]) -> tuple[Clip, ...]:
         start = min(float(channel.times[0]) for channel in channels)
         end = max(float(channel.times[-1]) for channel in channels)
         name = printable(animation.name or f"clip_{i}")
-        while name in {clip.name for clip in clips}:
+        while name in clips:
             name = f"{name}_{i}"
-        clips.append(Clip(name, channels, start, end - start))
-    return tuple(clips)
+        clips[name] = Clip(name, channels, start, end - start)
+    return tuple(clips.values())
 
 
 def _read_channels(source: Container, animation: Any, joint_of: dict[int, int], where: str) -> list[Channel]:

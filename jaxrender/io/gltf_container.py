@@ -24,7 +24,7 @@ from jaxrender.checks import InputError, bad_input
 MAX_FILE_BYTES = 2**31
 MAX_NUMBERS = 2**27
 # The parser spends about 0.2 ms and 1 kB on each JSON object, so that a small file of empty ones would
-# hold it for hours. The largest shared character has 8 thousand.
+# hold it for hours. The largest shared character has 9 thousand.
 MAX_JSON_OBJECTS = 300_000
 
 # Extensions that change nothing we read, or that we understand.

@@ -14,7 +14,7 @@ from PIL import Image
 
 from jaxrender.checks import InputError
 from jaxrender.io.gltf_accessors import read_floats
-from jaxrender.io.gltf_container import Container, OutsideFolderError
+from jaxrender.io.gltf_container import Container, OutsideFolderError, printable
 
 MAX_TEXELS = 2**26
 _REPEAT, _CLAMP, _MIRROR = 10497, 33071, 33648
@@ -74,7 +74,7 @@ def _texture_at(
     transform = transform if isinstance(transform, dict) else {}
     name = f"TEXCOORD_{transform.get('texCoord', info.texCoord or 0)}"
     if name not in attributes:
-        raise MissingTexture(f"no {name}")
+        raise MissingTexture(f"no {printable(name)}")
     uv = read_floats(source, attributes[name], ("VEC2",), f"{where}.{name}")
     uv = _one_a_vertex(source, uv, num_vertices, f"{where}.{name}")
     texture = source.item("textures", info.index, f"{where} -> baseColorTexture.index")

@@ -182,7 +182,10 @@ def _face_normals(surface: Surface) -> Float64[np.ndarray, "t 3"]:
 def _checked_influences(
     source: Container, surface: Surface, original: np.ndarray, num_joints: int, where: str
 ) -> Surface:
-    """The surface with weights that sum to 1, or InputError about the first vertex that is wrong."""
+    """The surface with weights that sum to 1, the largest first, without columns that no vertex needs.
+
+    InputError names the first vertex that is wrong.
+    """
     joints, weights = surface.joints, surface.weights
     for wrong, field, expected, values in (
         ((weights < 0).any(axis=1), "WEIGHTS", "weights >= 0", weights),
@@ -197,6 +200,8 @@ def _checked_influences(
     total = weights.astype(np.float64).sum(axis=1, keepdims=True)
     # 8-bit weights are off by up to 1/128; rounding of float32 ones is not worth a word.
     source.note("vertices whose weights were renormalized", int((np.abs(total - 1.0) > 1e-5).sum()))
-    return replace(
-        surface, joints=np.where(weights > 0, joints, 0), weights=(weights / total).astype(np.float32)
-    )
+    largest_first = np.argsort(-weights, axis=1, kind="stable")
+    largest_first = largest_first[:, : int((weights > 0).sum(axis=1).max())]
+    weights = np.take_along_axis(weights / total, largest_first, axis=1).astype(np.float32)
+    joints = np.take_along_axis(joints, largest_first, axis=1)
+    return replace(surface, joints=np.where(weights > 0, joints, 0), weights=weights)

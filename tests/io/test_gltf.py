@@ -1122,6 +1122,20 @@ def test_data_that_is_asked_for_again_and_again_is_refused(tmp_path):
     assert peak < 300e6  # one accessor at a time: 2^22 positions in float32, and the check's temporaries
 
 
+def test_many_influences_on_one_face_are_not_spread_over_a_large_mesh(tmp_path):
+    b = tetrahedron()
+    wide = copy.deepcopy(primitive(b))
+    for n in range(1, 40):
+        wide["attributes"] |= {f"JOINTS_{n}": 2, f"WEIGHTS_{n}": 3}
+    wide["attributes"] |= {f"WEIGHTS_{n}": b.accessor(g.WEIGHTS / 40) for n in range(40)}
+    # A strip without normals: three vertices a face.
+    large = {"POSITION": b.accessor(np.random.default_rng(0).uniform(size=(2**18, 3)))}
+    b.json["meshes"][0]["primitives"] = [wide]
+    b.json["meshes"].append({"primitives": [{"attributes": large, "mode": 5}]})
+    b.json["nodes"][0]["mesh"] = 1
+    refused(b, tmp_path, "meshes: expected at most")
+
+
 def test_accessor_without_data_has_a_largest_size(tmp_path):
     b = rigid()
     b.json["accessors"][0] = {"componentType": 5126, "count": 2**23, "type": "VEC3"}

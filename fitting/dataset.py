@@ -1,0 +1,187 @@
+"""What a model is trained on: shading points, poses and their baked visibility, in a resumable store on disk.
+
+The store is a zarr group with one chunk per frame. A frame is written whole, then its flag; an interrupted bake
+continues with the frames whose flag is missing and ends with the same bytes.
+"""
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+import zarr
+from jaxtyping import Float, Int, UInt8
+from scipy.spatial import cKDTree
+
+from fitting.config import BakeSettings
+from fitting.motion import Motion
+from jaxrender.animation.skeleton import global_matrices
+from jaxrender.animation.skinning import Character, skin_mesh
+from jaxrender.checks import bad_input, check_finite
+from jaxrender.harmonics.visibility import hemisphere_directions, trace_visibility
+from jaxrender.scene import MeshSequence
+
+STORE_VERSION = 1
+
+
+@dataclass(frozen=True)
+class ShadingPoints:
+    """The vertices that are traced, and for every mesh vertex the point that stands for it."""
+
+    vertices: Int[np.ndarray, " p"]
+    of_vertex: Int[np.ndarray, " v"]
+
+
+def choose_points(character: Character, max_points: int, *, seed: int = 0) -> ShadingPoints:
+    """One point for all vertices that move and are lit alike (texture seams, doubled corners).
+
+    With `max_points` a subset, drawn with the area around each vertex as its weight; every other vertex takes the
+    nearest point of its neighbourhood and orientation.
+    """
+    skin = character.skin
+    parts = (skin.vertices, skin.normals, skin.joint_indices, skin.weights)
+    rows = np.concatenate([np.asarray(part, np.float32).reshape(len(skin.vertices), -1) for part in parts], axis=1)
+    _, first, of_vertex = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    points = ShadingPoints(first, of_vertex.reshape(-1))
+    if max_points == 0 or len(first) <= max_points:
+        return points
+    at = np.asarray(skin.vertices, np.float64)
+    normals = np.asarray(skin.normals, np.float64)
+    corners = at[character.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    share = np.bincount(of_vertex.reshape(-1)[character.faces.reshape(-1)], np.repeat(area, 3), len(first)) + 1e-12
+    rng = np.random.default_rng(seed)
+    kept = np.sort(rng.choice(len(first), max_points, replace=False, p=share / share.sum()))
+    size = np.ptp(at, axis=0).max()
+    key = np.concatenate([at / size, 0.05 * normals], axis=1)
+    nearest = cKDTree(key[first[kept]]).query(key)[1]
+    return ShadingPoints(first[kept], nearest)
+
+
+PosedMesh = tuple[np.ndarray, np.ndarray]
+
+
+def character_frames(character: Character, motion: Motion) -> Callable[[int], PosedMesh]:
+    """Frame number -> world positions (v, 3) and vertex frames (v, 3, 3)."""
+
+    @jax.jit
+    def posed(pose):
+        mesh = skin_mesh(character.skin, global_matrices(pose, parents=character.skeleton.parents))
+        return mesh.positions, mesh.frames
+
+    def frame(index: int) -> PosedMesh:
+        pose = jax.tree.map(lambda values: values[index], motion.pose)
+        positions, frames = posed(pose)
+        return np.asarray(positions), np.asarray(frames)
+
+    return frame
+
+
+def sequence_frames(sequence: MeshSequence) -> Callable[[int], PosedMesh]:
+    """The same for a mesh sequence; its arrays are checked first."""
+    check_finite("mesh sequence", "vertices", np.asarray(sequence.vertices))
+    check_finite("mesh sequence", "frames", np.asarray(sequence.frames))
+    check_finite("mesh sequence", "features", np.asarray(sequence.features))
+    return lambda index: (np.asarray(sequence.vertices[index]), np.asarray(sequence.frames[index]))
+
+
+class VisibilityStore:
+    """Packed visibility of p points in f frames, on disk."""
+
+    def __init__(self, path: Path, *, num_frames: int, num_points: int, bake: BakeSettings, source: str):
+        """Opens the store at `path`, or makes it; one of other contents is replaced.
+
+        Args:
+          source: hash of the character, its poses and points.
+        """
+        self.path = path
+        header = {
+            "format": "jaxrender-visibility",
+            "version": STORE_VERSION,
+            "source": source,
+            "num_frames": num_frames,
+            "num_points": num_points,
+            "num_directions": bake.num_directions,
+        }
+        existing = _read_header(path)
+        self.resumed = existing == header
+        if not self.resumed:
+            if path.exists() and not (path / "zarr.json").is_file():
+                bad_input(path, "store", expected="nothing or a visibility store", got="something else")
+            shutil.rmtree(path, ignore_errors=True)
+            group = zarr.create_group(path)
+            bytes_per_point = -(-bake.num_directions // 8)
+            shape = (num_frames, num_points, bytes_per_point)
+            group.create_array("visibility", shape=shape, chunks=(1, *shape[1:]), dtype="uint8")
+            group.create_array("done", shape=(num_frames,), chunks=(1,), dtype="uint8", fill_value=0)
+            # The header comes last: a store without it is taken for unfinished and made anew.
+            group.attrs.update(header)
+        group = zarr.open_group(path, mode="r+")
+        self._visibility, self._done = group["visibility"], group["done"]
+
+    def missing(self) -> Int[np.ndarray, " n"]:
+        """Frames not baked yet."""
+        return np.flatnonzero(self._done[:] == 0)
+
+    def write(self, frame: int, bits: UInt8[np.ndarray, "p bytes"]) -> None:
+        self._visibility[frame] = bits
+        self._done[frame] = 1
+
+    def read(self) -> UInt8[np.ndarray, "f p bytes"]:
+        """All frames; a bit per ray, so 10,000 points x 300 frames x 256 directions are 96 MB."""
+        return self._visibility[:]
+
+
+def _read_header(path: Path) -> dict | None:
+    try:
+        return dict(zarr.open_group(path, mode="r").attrs)
+    except (OSError, ValueError, KeyError, json.JSONDecodeError):
+        return None
+
+
+@dataclass(frozen=True)
+class BakeStatistics:
+    num_rays: int
+    seconds: float
+    frames_done_before: int
+
+    @property
+    def rays_per_second(self) -> float:
+        return self.num_rays / max(self.seconds, 1e-9)
+
+
+def bake(
+    store: VisibilityStore,
+    frame: Callable[[int], PosedMesh],
+    faces: Int[np.ndarray, "t 3"],
+    points: Int[np.ndarray, " p"],
+    settings: BakeSettings,
+    *,
+    track: Callable[[Iterator[int], int], Iterator[int]] = lambda frames, _: frames,
+) -> BakeStatistics:
+    """Traces every missing frame into the store.
+
+    Args:
+      frame: frame number -> posed mesh.
+      track: wraps the iteration over frames, for progress display.
+    """
+    directions = hemisphere_directions(settings.num_directions)
+    faces = np.asarray(faces)
+    missing = store.missing()
+    started, total = time.perf_counter(), len(store._done)
+    for index in track(iter(missing), len(missing)):
+        positions, frames = frame(int(index))
+        if not (np.isfinite(positions).all() and np.isfinite(frames).all()):
+            bad_input(f"frame {index}", "vertices", expected="finite numbers", got="NaN or Inf after skinning")
+        store.write(int(index), trace_visibility(positions, frames, faces, directions, points=points))
+    seconds = time.perf_counter() - started
+    return BakeStatistics(len(missing) * len(points) * settings.num_directions, seconds, total - len(missing))
+
+
+def mean_visibility(bits: UInt8[np.ndarray, "f p bytes"], num_directions: int) -> Float[np.ndarray, "f p"]:
+    """Share of free directions per frame and point."""
+    return np.bitwise_count(bits).sum(axis=-1, dtype=np.float32) / num_directions
