@@ -98,7 +98,7 @@ class VisibilityStore:
         Args:
           source: hash of the character, its poses and points.
         """
-        self.path = path
+        self.path, self.num_frames = path, num_frames
         header = {
             "format": "jaxrender-visibility",
             "version": STORE_VERSION,
@@ -172,7 +172,7 @@ def bake(
     directions = hemisphere_directions(settings.num_directions)
     faces = np.asarray(faces)
     missing = store.missing()
-    started, total = time.perf_counter(), len(store._done)
+    started, total = time.perf_counter(), store.num_frames
     for index in track(iter(missing), len(missing)):
         positions, frames = frame(int(index))
         if not (np.isfinite(positions).all() and np.isfinite(frames).all()):

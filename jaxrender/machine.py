@@ -16,6 +16,18 @@ def num_cores() -> int:
     return os.cpu_count() or 1
 
 
+def keep_xla_to_one_thread() -> None:
+    """Lets XLA's CPU programs run on their calling thread; call it before JAX makes its first array.
+
+    XLA's own pool of threads can lose a task and wait for ever on a batched program (seen with jaxlib 0.10.2 on two
+    cores, within minutes of training; also reported by others in 2026). The commands and the training therefore
+    switch the pool off and spread their blocks of work over threads of their own. A setting of the user's stays.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_cpu_multi_thread_eigen" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
+
+
 def cpu_model() -> str:
     """The processor's name, as far as the system tells."""
     return _cpu_info("model name") or platform.processor() or platform.machine()

@@ -6,6 +6,10 @@ import jax
 import numpy as np
 import pytest
 
+from jaxrender.machine import keep_xla_to_one_thread
+
+keep_xla_to_one_thread()
+
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_debug_nans", True)

@@ -47,12 +47,20 @@ def joint_hops(positions: Float[np.ndarray, "j 3"], parents: Sequence[int]) -> I
 
 
 def spread_limbs(
-    rest: Float[np.ndarray, "j 4 4"], parents: Sequence[int], body: Landmarks | None
+    rest: Float[np.ndarray, "j 4 4"],
+    parents: Sequence[int],
+    body: Landmarks | None,
+    *,
+    thickness: float = 0.0,
 ) -> Float[np.ndarray, "j 4 4"]:
-    """World from joint with arms and legs of a human at an angle, or the bones of any other tree apart."""
+    """World from joint with arms and legs of a human at an angle, or the bones of any other tree apart.
+
+    Args:
+      thickness: radius that every bone of a tree takes at least.
+    """
     hanging = _hanging(parents)
     if body is None:
-        return _push_apart(rest, parents, hanging)
+        return _push_apart(rest, parents, hanging, thickness)
     matrices = rest.copy()
     positions = rest[:, :3, 3]
     hips, shoulders = middle(positions, body.thigh), middle(positions, body.upper_arm)
@@ -74,10 +82,14 @@ def _spread_turn(
     if min(np.linalg.norm(limb), np.linalg.norm(down)) == 0:
         return np.zeros(3)
     limb, down = unit(limb), unit(down)
-    axis = np.cross(down, limb)
-    angle = np.arctan2(np.linalg.norm(axis), limb @ down)
-    if np.linalg.norm(axis) < 0.02:  # as good as straight down, or up: then outward
-        axis = np.cross(down, outward)
+    away = limb - (limb @ down) * down
+    out = outward - (outward @ down) * down
+    # A limb that leans inward is brought through straight down; one as good as straight goes outward.
+    if away @ out < 0:
+        away, angle = -away, -np.arctan2(np.linalg.norm(away), limb @ down)
+    else:
+        angle = np.arctan2(np.linalg.norm(away), limb @ down)
+    axis = np.cross(down, away if np.linalg.norm(away) > 0.02 else out)
     if np.linalg.norm(axis) == 0:
         return np.zeros(3)
     return unit(axis) * (np.clip(angle, *np.radians(degrees)) - angle)
@@ -104,7 +116,7 @@ def _turn_joint(matrices: np.ndarray, hanging: np.ndarray, joint: int, turn: np.
 
 
 def _push_apart(
-    rest: np.ndarray, parents: Sequence[int], hanging: np.ndarray, num_rounds: int = 60
+    rest: np.ndarray, parents: Sequence[int], hanging: np.ndarray, thickness: float, num_rounds: int = 60
 ) -> Float[np.ndarray, "j 4 4"]:
     """Bones that lie closer than their thickness allows, although far apart along the tree, are turned away.
 
@@ -121,7 +133,8 @@ def _push_apart(
     if extent == 0 or not 2 <= len(ends) <= _MAX_BONES:
         return rest
     starts = np.asarray(parents)[ends]
-    radius = np.array([max(part.radius_a, part.radius_b) for part in tree_parts(positions, parents)])
+    parts = tree_parts(positions, parents)
+    radius = np.array([max(part.radius_a, part.radius_b, thickness) for part in parts])
 
     # Points on the bones; which bones they must keep away from, and by how much.
     share = np.tile([0.0, 0.5, 1.0], len(ends))

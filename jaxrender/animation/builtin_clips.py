@@ -80,7 +80,7 @@ _STRIKE = 0.25  # how far ahead of the hips the ankle is when the heel strikes
 # The foot turns about the heel until it is flat, and about the ball when the heel rises. Share of the cycle
 # since the heel struck; degrees, positive with the toes down. After Perry, "Gait Analysis", 1992, chapter 3.
 _FOOT_PITCH = np.array(
-    [[0, -18], [0.1, 0], [0.36, 0], [0.48, 14], [0.62, 46], [0.7, 44], [0.82, 8], [0.92, -16]]
+    [[0, -18], [0.1, 0], [0.36, 0], [0.48, 14], [0.62, 46], [0.7, 44], [0.82, 8], [0.92, -16], [1, -18]]
 )
 _HEEL, _BALL = -0.045, 0.125  # ahead of the ankle, on the ground
 
@@ -112,13 +112,12 @@ def _walk() -> Clip:
 
 
 def _foot_pitch(phase: np.ndarray) -> np.ndarray:
-    """Radians; monotone between its keys, so that a flat foot stays flat."""
-    knots = np.concatenate([_FOOT_PITCH + [shift, 0.0] for shift in (-1.0, 0.0, 1.0)])
-    return np.radians(PchipInterpolator(knots[:, 0], knots[:, 1])(phase))
+    """Radians at each phase."""
+    return np.radians(_closed_curve(_FOOT_PITCH[:, 0], _FOOT_PITCH[:, 1], phase))
 
 
 def _planted(phase: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """The ankle of a foot on the ground: it turns about heel or ball, and that slides back with the ground."""
+    """The ankle of a foot on the ground: it turns about heel or ball, which slides back with the ground."""
     pitch = _foot_pitch(phase)
     pivot = np.where(pitch < 0, _HEEL, _BALL)
     y = rest[1] * np.cos(pitch) + pivot * np.sin(pitch)
@@ -168,12 +167,8 @@ def _turn() -> Clip:
         outward, ahead, bend = np.array([neutral, order[0], neutral, order[1], neutral], dtype=np.float64).T
         turns[f"{side}Arm"] = _keyed(times, keys, _aimed(side, outward, ahead))
         turns[f"{side}ForeArm"] = _keyed(times, keys, _elbow(side, bend))
-    hips = CubicSpline(
-        keys,
-        np.array([[0, -0.012, 0], [0.03, -0.02, 0], [0, -0.012, 0], [-0.03, -0.02, 0], [0, -0.012, 0]]),
-        bc_type="periodic",
-    )(times)
-    return _clip("turn", times, hips, turns, *_standing(len(times)))
+    hips = np.array([[0, -0.012, 0], [0.03, -0.02, 0], [0, -0.012, 0], [-0.03, -0.02, 0], [0, -0.012, 0]])
+    return _clip("turn", times, _closed_curve(keys, hips, times), turns, *_standing(len(times)))
 
 
 def _reach() -> Clip:
@@ -200,11 +195,17 @@ def _reach() -> Clip:
     for side, (outward, ahead, bend) in arms.items():
         turns[f"{side}Arm"] = _keyed(times, keys, _aimed(side, np.asarray(outward), np.asarray(ahead)))
         turns[f"{side}ForeArm"] = _keyed(times, keys, _elbow(side, np.asarray(bend, dtype=np.float64)))
-    lowered = np.array(
-        [[0, -0.012, 0], [0, -0.02, -0.02], [0, -0.006, 0.01], [0.02, -0.03, 0], [0, -0.33, -0.14]]
+    hips = np.array(
+        [
+            [0, -0.012, 0],
+            [0, -0.02, -0.02],
+            [0, -0.01, 0.01],
+            [0.02, -0.03, 0],
+            [0, -0.33, -0.14],
+            [0, -0.012, 0],
+        ]
     )
-    hips = CubicSpline(keys, np.concatenate([lowered, lowered[:1]]), bc_type="periodic")(times)
-    return _clip("reach", times, hips, turns, *_standing(len(times)))
+    return _clip("reach", times, _closed_curve(keys, hips, times), turns, *_standing(len(times)))
 
 
 def _standing(num_frames: int) -> tuple[dict[str, np.ndarray], dict[str, Rotation]]:
@@ -228,10 +229,18 @@ def _degrees(x, y, z) -> Rotation:
     return Rotation.from_euler("YZX", np.stack([y, z, x], axis=-1), degrees=True)
 
 
+def _closed_curve(keys: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """A smooth closed curve through values, of which the last is the first again.
+
+    Monotone between keys, so that a flat foot stays flat and the hips do not rise out of reach of the feet.
+    """
+    around = np.concatenate([keys[:-1] - keys[-1], keys[:-1], keys + keys[-1]])
+    return PchipInterpolator(around, np.concatenate([values[:-1], values[:-1], values]))(times)
+
+
 def _keyed(times: np.ndarray, keys: np.ndarray, rotations: Rotation) -> Rotation:
     """A smooth closed curve through rotations, of which the last is the first again."""
-    period = keys[-1] - keys[0]
-    around = np.concatenate([keys[:-1] - period, keys[:-1], keys + period])
+    around = np.concatenate([keys[:-1] - keys[-1], keys[:-1], keys + keys[-1]])
     return RotationSpline(around, Rotation.concatenate([rotations[:-1], rotations[:-1], rotations]))(times)
 
 

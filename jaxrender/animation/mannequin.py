@@ -117,8 +117,8 @@ def bone_weights(
     """Joints that move some part, and their shares of every vertex, which sum to 1.
 
     Each vertex first belongs to the parts nearest to it, then the shares spread over the surface as heat
-    does, over half the thickness of the limb. Heat does not jump from a hand to the thigh beside it; and
-    joints more than two bones from that of the nearest part get nothing.
+    does, over half the thickness of the limb and one edge at least. Heat does not jump from a hand to the
+    thigh beside it; and joints more than two bones from that of the nearest part get nothing.
 
     References:
       Baran and Popović, "Automatic Rigging and Animation of 3D Characters", SIGGRAPH 2007, section 4, for
@@ -144,13 +144,16 @@ def bone_weights(
 def _spread_heat(
     values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, width: np.ndarray
 ) -> np.ndarray:
-    """Solves (1 - w² Δ) u = values on the surface: a step spreads as exp(-x / w) to both sides."""
+    """Solves (1 - w² Δ) u = values on the surface: a step spreads as exp(-x / w) to both sides.
+
+    w is `width`, and no less than the mean edge.
+    """
     pairs = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     i, j = pairs.T
     size = len(vertices)
     # On triangles of like size the mean of the neighbours, less the vertex, is edge² / 4 times Δ.
     edge2 = np.mean(np.sum((vertices[i] - vertices[j]) ** 2, axis=1))
-    flow = 4.0 * (0.5 * (width[i] + width[j])) ** 2 / edge2
+    flow = 4.0 * np.maximum((0.5 * (width[i] + width[j])) ** 2 / edge2, 1.0)
     flows = scipy.sparse.coo_matrix((flow, (i, j)), shape=(size, size))
     flows = flows + flows.T
     degree = np.bincount(pairs.ravel(), minlength=size).astype(np.float64)

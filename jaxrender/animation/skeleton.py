@@ -210,10 +210,13 @@ def sample_keys(
     t = jnp.clip((times - key_times[before])[:, None] / span, 0.0, 1.0)
     if interpolation == "CUBICSPLINE":
         curve = cubic_spline(knots[before], values[before, 2], knots[after], values[after, 0], t, span=span)
-        return normalize(curve) if rotation else curve
-    if rotation:
-        return slerp(knots[before], knots[after], t)
-    return (1.0 - t) * knots[before] + t * knots[after]
+        curve = normalize(curve) if rotation else curve
+    elif rotation:
+        curve = slerp(knots[before], knots[after], t)
+    else:
+        curve = (1.0 - t) * knots[before] + t * knots[after]
+    # The last key as it is stored: slerp may arrive at its opposite, which is the same rotation.
+    return jnp.where((times >= key_times[last])[:, None], knots[last:], curve)
 
 
 def sample_clip(clip: Clip, skeleton: Skeleton, times: Float[Array, " f"]) -> Pose:

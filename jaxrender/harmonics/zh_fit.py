@@ -234,6 +234,16 @@ def fit_shared_axes(
     return _towards_normal(found).reshape(*lead, num_lobes, 3)
 
 
+def spread_start_axes(
+    sh: Float[Array, "f p k"], *, num_lobes: int, order: int, count: int
+) -> Float[Array, "s p c 3"]:
+    """Start axes for p points with f vectors each, by matching pursuit from `count` different first directions."""
+    by_point = jnp.swapaxes(sh, 0, 1)
+    virtual = _virtual_vectors(jnp.einsum("pfi,pfj->pij", by_point, by_point), order)
+    greedy = jax.vmap(lambda first: greedy_axes(virtual, num_lobes=num_lobes, order=order, first=first))
+    return _towards_normal(greedy(jnp.arange(count)))
+
+
 def _virtual_vectors(moments: Float[Array, "*b k k"], order: int) -> Float[Array, "*b n k"]:
     """2·order-1 vectors with the same second moments within each band as the given ones."""
     rows = []

@@ -32,7 +32,8 @@ MAX_BYTES = 1 << 28
 
 MAX_JOINTS = 2000
 
-_FARTHEST = 1e6
+_LARGEST = 1e9  # in units of the file or degrees; what is larger is damage
+_FARTHEST = 1e6  # metres
 _CHANNEL = re.compile(r"([xyz])(position|rotation)", re.IGNORECASE)
 
 
@@ -95,7 +96,7 @@ def parse_bvh(
 ) -> BvhMotion:
     """Reads a BVH file; arguments and errors as in `read_bvh`."""
     path = Path(path)
-    if metres_per_unit is not None and not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
+    if metres_per_unit is not None and not 0 < metres_per_unit < float("inf"):
         raise ValueError(f"metres_per_unit: expected a positive number, got {metres_per_unit}")
     content = _read_bytes(path)
     lines = _Lines(path, content)
@@ -118,7 +119,7 @@ def parse_bvh(
     if scale is None:
         scale, reason = _guess_scale(names, parents, offsets)
         notes.append(f"unit taken as {scale:.4g} m: {reason}")
-    farthest = scale * max(np.abs(track).max() for track in (offsets, *positions.values()))
+    farthest = scale * max(float(np.abs(track).max()) for track in (offsets, *positions.values()))
     if not farthest < _FARTHEST:
         bad_input(path, "positions", expected=f"coordinates below {_FARTHEST:g} m", got=f"{farthest:.3g} m")
 
@@ -192,7 +193,7 @@ class _Lines:
         bad_input(f"{self.path}:{self.number}", what, expected=expected, got=got)
 
     def numbers(self, words: list[str], what: str, count: int) -> Float[np.ndarray, " n"]:
-        """`count` finite numbers."""
+        """`count` numbers, finite and below 1e9 in size."""
         if len(words) != count:
             self.fail(what, expected=f"{count} numbers", got=len(words))
         values = np.empty(count)
@@ -201,8 +202,9 @@ class _Lines:
                 values[i] = float(word)
             except ValueError:
                 self.fail(what, expected="a number", got=_short(word))
-        if not np.isfinite(values).all():
-            self.fail(what, expected="finite numbers", got=words[int(np.argmin(np.isfinite(values)))])
+        sound = np.abs(values) < _LARGEST
+        if not sound.all():
+            self.fail(what, expected=f"numbers below {_LARGEST:g}", got=_short(words[int(np.argmin(sound))]))
         return values
 
 
@@ -422,7 +424,7 @@ def _guess_scale(names: tuple[str, ...], parents: tuple[int, ...], offsets: np.n
     if height is not None:
         return STATURE / height, f"the legs are those of a person of {STATURE} m"
     extent = np.ptp(positions, axis=0)
-    largest = max(extent[1], extent.max())
+    largest = float(extent.max())
     if largest > 0:
         return STATURE / largest, f"the rest pose then measures {STATURE} m"
     return 1.0, "the skeleton has no extent"

@@ -199,6 +199,16 @@ def test_spline_of_rotations_is_of_unit_length_and_keeps_its_keys(rng):
     assert_close(at_keys, values[:, 1], ulps=4, dtype=np.float32)
 
 
+def test_linear_rotations_keep_their_keys_signs_included(rng):
+    times = jnp.asarray([0.0, 0.5, 1.5])
+    keys = unit_quaternions(rng, 3)
+    keys[2] *= -np.sign(keys[1] @ keys[2])  # more than a quarter turn on the sphere of quaternions
+    keys = jnp.asarray(keys, dtype=jnp.float32)
+    at = jnp.asarray([-1.0, 0.0, 0.5, 1.5, 9.0])
+    got = sample_keys(times, keys, at, interpolation="LINEAR", rotation=True)
+    assert_close(got, keys[jnp.asarray([0, 0, 1, 2, 2])], ulps=4, dtype=np.float32)
+
+
 @pytest.mark.parametrize("interpolation", ["STEP", "LINEAR", "CUBICSPLINE"])
 def test_one_key_is_a_constant(interpolation):
     value = jnp.asarray([[1.0, 2.0, 3.0]])

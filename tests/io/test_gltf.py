@@ -1125,9 +1125,9 @@ def test_data_that_is_asked_for_again_and_again_is_refused(tmp_path):
 def test_many_influences_on_one_face_are_not_spread_over_a_large_mesh(tmp_path):
     b = tetrahedron()
     wide = copy.deepcopy(primitive(b))
-    for n in range(1, 40):
+    for n in range(1, 60):
         wide["attributes"] |= {f"JOINTS_{n}": 2, f"WEIGHTS_{n}": 3}
-    wide["attributes"] |= {f"WEIGHTS_{n}": b.accessor(g.WEIGHTS / 40) for n in range(40)}
+    wide["attributes"] |= {f"WEIGHTS_{n}": b.accessor(g.WEIGHTS / 60) for n in range(60)}
     # A strip without normals: three vertices a face.
     large = {"POSITION": b.accessor(np.random.default_rng(0).uniform(size=(2**18, 3)))}
     b.json["meshes"][0]["primitives"] = [wide]

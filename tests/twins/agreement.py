@@ -42,8 +42,7 @@ def check(case: Case, dtype: Any) -> None:
         entrywise=case.entrywise,
         what=case.id,
     )
-    ulps = case.gradient_ulps64 if wide else case.gradient_ulps32
-    assert_close(*slopes, ulps=ulps, dtype=dtype, what=f"{case.id} gradient")
+    assert_close(*slopes, ulps=case.gradient_ulps, dtype=dtype, what=f"{case.id} gradient")
 
 
 @functools.cache

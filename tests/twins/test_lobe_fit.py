@@ -1,4 +1,4 @@
-"""The searches for lobe axes against the twin's: two ways down the same landscape, judged by where they end."""
+"""The searches for lobe axes against the twin's: two ways down one landscape, judged by where they end."""
 
 import jax
 import jax.numpy as jnp
@@ -52,8 +52,10 @@ def test_free_fit_is_as_good_as_brute_force(rng):
 
 @pytest.mark.slow
 def test_anchored_fit_ends_at_the_same_axes(rng):
-    """Started at its anchors the penalised problem is the same for both, and so is the minimum they reach."""
-    v, anchors = rng.normal(size=(8, ORDER**2)), rng.normal(size=(8, NUM_LOBES, 3))
+    """Anchored near a good fit, as the next frame of a motion is, both reach the same minimum."""
+    v = visibilities(rng, 8)
+    free = twin.fit_zh_lobes(torch.tensor(v), num_lobes=NUM_LOBES, order=ORDER).axes.numpy()
+    anchors = free + 0.1 * rng.normal(size=free.shape)
     anchors /= np.linalg.norm(anchors, axis=-1, keepdims=True)
     options = {"num_lobes": NUM_LOBES, "order": ORDER, "anchor": 0.1, "num_steps": 60}
     theirs = twin.fit_zh_lobes(torch.tensor(v), anchor_axes=torch.tensor(anchors), **options)
@@ -61,9 +63,8 @@ def test_anchored_fit_ends_at_the_same_axes(rng):
         ours = compiled(lambda x, a: zh_fit.fit_zh_lobes(x, anchor_axes=a, **options), v, anchors)
         ours = [np.asarray(x) for x in (ours.axes, ours.coefficients, ours.residual)]
     apart = np.abs(ours[0] - theirs.axes.numpy()).max((-1, -2))
-    # Levenberg-Marquardt closes in linearly on a minimum with a residual, so one of the eight may be on its way.
-    assert (apart < 1e-5).sum() >= 7
-    assert (apart < 1e-2).all()
+    # Next to a minimum the error grows with the square: 1e-4 costs 1e-8, all that float32 can tell apart.
+    assert apart.max() < 1e-4
     objectives = [
         _penalised(anchors, *lobes, options["anchor"])
         for lobes in (ours, [x.numpy() for x in (theirs.axes, theirs.coefficients, theirs.residual)])
