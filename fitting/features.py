@@ -95,9 +95,13 @@ def fit_basis(
     axes, moments = np.zeros((num_groups, width, k)), np.zeros((num_groups, k))
     for g in range(num_groups):
         scaled = np.sqrt(w)[:, None] * (rows[:, g] - mean[g])
-        _, s, vt = np.linalg.svd(scaled, full_matrices=False)
-        rank = int((s[:k] > 1e-6 * max(s[0], 1e-30)).sum())
-        axes[g, :, :rank], moments[g, :rank] = vt[:rank].T, s[:rank] ** 2
+        # The smaller Gram matrix instead of an SVD: ten times faster here, and in float64 exact far below the cut.
+        wide = len(rows) < width
+        values, vectors = np.linalg.eigh(scaled @ scaled.T if wide else scaled.T @ scaled)
+        values, vectors = values[::-1][:k], vectors[:, ::-1][:, :k]
+        rank = int((values > 1e-12 * max(values[0], 1e-30)).sum())
+        directions = scaled.T @ vectors[:, :rank] / np.sqrt(values[:rank]) if wide else vectors[:, :rank]
+        axes[g, :, :rank], moments[g, :rank] = directions, values[:rank]
     fitted = dataclasses.replace(
         basis, mean=jnp.asarray(mean, jnp.float32), basis=jnp.asarray(axes, jnp.float32)
     )

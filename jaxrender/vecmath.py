@@ -4,8 +4,17 @@ Pointwise: every function takes `(..., 3)`. A division or root that could meet z
 the operation (the bad input is swapped, then the result selected), so reverse-mode gradients stay finite.
 """
 
+import functools
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+# Contractions in full float32. By default XLA may round their factors to the 10 bits of TF32 on a GPU, or to
+# bfloat16 on a TPU, which would cost these kernels four of their seven digits.
+einsum = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+matmul = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
 
 
 def dot(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"]) -> Float[Array, "*#b 1"]:
@@ -55,6 +64,8 @@ def frame_from_normal_tangent(
     t = tangent - dot(tangent, normal) * normal
     lost = dot(t, t) <= 1e-12 * jnp.maximum(dot(tangent, tangent), 1e-30)
     t = normalize(jnp.where(lost, orthonormal_tangent(normal), t))
+    # Once more: what is left of a nearly parallel tangent carries its rounding error enlarged.
+    t = normalize(t - dot(t, normal) * normal)
     return jnp.stack([t, jnp.cross(normal, t), normal], axis=-1)
 
 
@@ -69,10 +80,11 @@ def reflection_frame(wo: Float[Array, "*b 3"], n: Float[Array, "*b 3"]) -> Float
     return jnp.stack([t, jnp.cross(r, t), r], axis=-1)
 
 
-def constant_like(table, x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """A NumPy table as a constant of x's dtype, with leading axes of size 1 up to x's rank.
+def constant_like(table: np.ndarray | Array, x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A table as a constant of x's dtype, with leading axes of size 1 up to x's rank.
 
-    Broadcasts are written out in this package; this is how a table of trailing axes meets an array of any rank.
+    Broadcasts are written out in this package; this is how a table of trailing axes meets an array of any
+    rank.
     """
-    table = jnp.asarray(table, dtype=x.dtype)
-    return table.reshape((1,) * (x.ndim - table.ndim) + table.shape)
+    constant = jnp.asarray(table, dtype=x.dtype)
+    return constant.reshape((1,) * (x.ndim - constant.ndim) + constant.shape)

@@ -201,10 +201,7 @@ def mesh_body(
     References:
       Lewiner et al., "Efficient Implementation of Marching Cubes' Cases with Topological Guarantees", 2003.
     """
-    area = (
-        2.0 * np.pi * np.sum(body.radius.mean(1) * body.stretch.mean(1) * (body.length + body.radius.mean(1)))
-    )
-    step = float(np.sqrt(area / num_vertices))
+    step = grid_step(body, num_vertices)
     low, high = _bounds(body)
     num_splits = 0
     while np.prod((high - low) / step) * 8.0**-num_splits > _MAX_CELLS:
@@ -232,6 +229,13 @@ def mesh_body(
     for _ in range(num_splits):
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)
     return _relax(thick, vertices, faces), faces, thick
+
+
+def grid_step(body: Body, num_vertices: int) -> float:
+    """About the grid spacing that gives so many vertices, from the area of the parts."""
+    radius = body.radius.mean(axis=1)
+    area = 2.0 * np.pi * np.sum(radius * body.stretch.mean(axis=1) * (body.length + radius))
+    return float(np.sqrt(area / num_vertices))
 
 
 def _bounds(body: Body) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from jaxrender.animation.anatomy import find_landmarks, recognize
 from jaxrender.animation.bind_pose import joint_hops, rest_matrices, spread_limbs
 from jaxrender.animation.body_parts import tree_parts
-from jaxrender.animation.body_surface import Body, assemble, mesh_body, part_distances
+from jaxrender.animation.body_surface import Body, assemble, grid_step, mesh_body, part_distances
 from jaxrender.animation.builtin_clips import builtin_clips, builtin_skeleton
 from jaxrender.animation.human_parts import human_parts
 from jaxrender.animation.skeleton import Clip, Skeleton
@@ -54,9 +54,11 @@ def grow_mannequin(
     roles = recognize(skeleton.names, parents)
     landmarks = find_landmarks(parents, roles)
 
-    bind = spread_limbs(rest, parents, landmarks)
+    # Coarse meshes have thick limbs, which must be further apart.
+    hops = joint_hops(rest[:, :3, 3], parents)
+    step = grid_step(assemble(tree_parts(rest[:, :3, 3], parents), hops), num_vertices)
+    bind = spread_limbs(rest, parents, landmarks, thickness=step)
     positions = bind[:, :3, 3]
-    hops = joint_hops(positions, parents)
     parts = human_parts(positions, parents, roles, landmarks) if landmarks is not None else None
     body = assemble(parts or tree_parts(positions, parents), hops)
     vertices, faces, body = mesh_body(body, num_vertices=num_vertices)

@@ -1,4 +1,4 @@
-"""Spherical-harmonic visibility of characters: mesh sequence -> visibility -> lobes -> linear model -> relight."""
+"""Spherical-harmonic visibility of characters: meshes -> visibility -> lobes -> linear model -> relight."""
 
 from jaxrender.harmonics.brdf_operator import apply_operator as apply_operator
 from jaxrender.harmonics.brdf_operator import brdf_operator as brdf_operator

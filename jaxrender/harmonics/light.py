@@ -10,19 +10,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrender.checks import check_at_least, check_order
-from jaxrender.harmonics.sh import bands, order_of, sh_basis
+from jaxrender.harmonics.sh import bands, basis_columns, order_of, sh_basis
 from jaxrender.harmonics.zh import zh_to_sh
-from jaxrender.vecmath import constant_like
+from jaxrender.vecmath import constant_like, einsum
 
 
 def environment_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions (h, w, 3) of the pixel centres of a latitude-longitude image and their solid angles (h, w).
 
-    Row 0 is the zenith (+Y); the middle of the image looks down -Z and columns turn towards +X. The solid angles
-    are exact (cosine differences), 4π in all.
+    Row 0 is the zenith (+Y); the middle of the image looks down -Z and columns turn towards +X. The solid
+    angles are exact (cosine differences), 4π in all.
     """
     theta = (np.arange(height) + 0.5) * (math.pi / height)
-    phi = (np.arange(width) + 0.5) * (2 * math.pi / width) - math.pi
+    phi = _azimuths(width)
     edges = np.cos(np.arange(height + 1) * (math.pi / height))
     solid = np.repeat((edges[:-1] - edges[1:])[:, None] * (2 * math.pi / width), width, axis=1)
     s, c = np.sin(theta)[:, None], np.cos(theta)[:, None]
@@ -30,20 +30,48 @@ def environment_directions(height: int, width: int) -> tuple[np.ndarray, np.ndar
     return np.stack(parts, axis=-1), solid
 
 
+def _azimuths(width: int) -> np.ndarray:
+    return (np.arange(width) + 0.5) * (2 * math.pi / width) - math.pi
+
+
+def _waves(phi: np.ndarray, order: int) -> np.ndarray:
+    """1, cos φ, sin φ, cos 2φ, ... up to order-1: (n, 2·order-1)."""
+    m = (np.arange(2 * order - 1) + 1) // 2
+    angles = phi[:, None] * m
+    return np.where(np.arange(2 * order - 1) % 2, np.cos(angles), np.sin(angles) + (m == 0))
+
+
+def _row_table(height: int, order: int) -> np.ndarray:
+    """T[row, wave, k]: y_k along a row of the map is Σ T · wave(φ), a trigonometric polynomial of order-1.
+
+    Its 2·order-1 terms are found exactly from as many azimuths.
+    """
+    count = 2 * order - 1
+    directions, _ = environment_directions(height, count)
+    basis = np.stack(basis_columns(*np.moveaxis(directions, -1, 0), order=order), axis=-1)
+    norm = np.where(np.arange(count) == 0, 1.0, 2.0) / count
+    return np.einsum("hjk,jt->htk", basis, _waves(_azimuths(count), order) * norm)
+
+
 def project_environment(image: Float[Array, "h w c"], *, order: int) -> Float[Array, "c k"]:
-    """Projects a latitude-longitude radiance map on SH, one vector per channel.
+    """Projects a latitude-longitude radiance map on SH, one vector per channel: Σ pixel · solid angle · y.
+
+    Rows first go into Fourier sums of their azimuth, of which the harmonics of a row are made: 2·order-1
+    numbers per pixel row instead of order² per pixel, and no array larger than the image.
 
     Args:
-      image: linear radiance; row 0 is +Y, the middle looks down -Z, columns turn towards +X. It must be finite
-        (`jaxrender.io.read_environment` sees to that).
+      image: linear radiance; row 0 is +Y, the middle looks down -Z, columns turn towards +X. It must be
+        finite (`jaxrender.io.read_environment` sees to that).
     """
     check_order(order)
     if image.ndim != 3:
         raise ValueError(f"image: expected shape (h, w, c), got {tuple(image.shape)}")
-    directions, solid = environment_directions(*image.shape[:2])
-    rows = jnp.asarray(directions, dtype=image.dtype)
-    weighted = image * jnp.asarray(solid, dtype=image.dtype)[..., None]
-    return jnp.einsum("hwc,hwk->ck", weighted, sh_basis(rows, order=order))
+    height, width = image.shape[:2]
+    _, solid = environment_directions(height, 1)
+    waves = _waves(_azimuths(width), order)
+    table = _row_table(height, order) * (solid / width)[:, :, None]
+    rows = einsum("hwc,wt->htc", image, jnp.asarray(waves, dtype=image.dtype))
+    return einsum("htc,htk->ck", rows, jnp.asarray(table, dtype=image.dtype))
 
 
 def sh_directional_light(

@@ -31,8 +31,8 @@ def membrane_transfer(
       visibility: SH visibility in the vertex frame (z = normal), zero below the surface.
       transmission: τ in [0, 1], colour of the light that passes, times the local thinness.
     References:
-      Sloan, Luna, Snyder, "Local, Deformable Precomputed Radiance Transfer", 2005, eq. 22; Nowrouzezahrai et al.,
-      "Shadowed Relighting of Dynamic Geometry with 1D BRDFs", section 4.1.
+      Sloan, Luna, Snyder, "Local, Deformable Precomputed Radiance Transfer", 2005, eq. 22; Nowrouzezahrai et
+      al., "Shadowed Relighting of Dynamic Geometry with 1D BRDFs", section 4.1.
     """
     one = jnp.ones((), dtype=visibility.dtype)
     front = apply_operator(phong_operator(one, order=order) / math.pi, visibility)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from jaxrender.checks import check_last_axis, check_one_of, check_order
-from jaxrender.vecmath import constant_like
+from jaxrender.vecmath import constant_like, einsum, matmul
 
 LAYOUTS = ("gaussian_splatting", "e3nn", "scipy", "positive")
 
@@ -38,7 +38,7 @@ def basis_columns(x, y, z, *, order: int) -> list:
     y_{l,m} = √2 (-1)^m Q_l^m c_m and y_{l,-m} = √2 (-1)^m Q_l^m s_m. Q obeys the usual three-term
     recurrence upward in l, which is stable.
     """
-    columns = [None] * order**2
+    columns: list = [None] * order**2
     c, s = x * 0.0 + 1.0, x * 0.0
     diagonal = 1.0 / math.sqrt(4.0 * math.pi)
     for m in range(order):
@@ -81,7 +81,7 @@ def sh_project(
       values: f at the directions.
       weights: solid angle of each direction, in steradians (4π in all for the sphere).
     """
-    return values @ (sh_basis(directions, order=order) * weights[:, None])
+    return matmul(values, sh_basis(directions, order=order) * weights[:, None])
 
 
 def sh_evaluate(sh: Float[Array, "*#b k"], directions: Float[Array, "*#b 3"]) -> Float[Array, "*b"]:
@@ -100,23 +100,26 @@ def rotation_table(order: int) -> tuple[np.ndarray, np.ndarray]:
     Returns:
       axes (2·order-1, 3) and analysis (2·order-1, order²): c_{l,i} = Σ_m analysis[i, lm] f_lm.
     """
-    count = 2 * order - 1
-    best = None
-    # A handful of seeded spirals over the half sphere; the best conditioned one is kept. Antipodal
-    # axes span the same lobe, so only a half sphere is covered.
+    # A handful of seeded spirals over the half sphere; the best conditioned one is kept (3.5 for order 4, 12
+    # for order 10). Antipodal axes span the same lobe, so only a half sphere is covered.
     rng = np.random.default_rng(0)
-    for _ in range(200 if order > 1 else 1):
-        z = (np.arange(count) + rng.uniform(0.1, 0.9)) / count
-        phi = np.arange(count) * math.pi * (3 - math.sqrt(5)) * rng.uniform(0.5, 1.5) + rng.uniform(0, 6.3)
-        r = np.sqrt(1 - z * z)
-        axes = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
-        basis = np.stack(basis_columns(*axes.T, order=order), axis=-1)
-        condition = max(np.linalg.cond(basis[:, l * l : (l + 1) ** 2]) for l in range(order))
-        if best is None or condition < best[0]:
-            best = condition, axes, basis
-    _, axes, basis = best
-    pieces = [np.linalg.pinv(basis[:, l * l : (l + 1) ** 2].T) for l in range(order)]
-    return axes, np.concatenate(pieces, axis=-1)
+    spirals = [_spiral(2 * order - 1, rng) for _ in range(200 if order > 1 else 1)]
+    blocks = [_band_blocks(axes, order) for axes in spirals]
+    best = min(range(len(spirals)), key=lambda i: max(np.linalg.cond(block) for block in blocks[i]))
+    return spirals[best], np.concatenate([np.linalg.pinv(block.T) for block in blocks[best]], axis=-1)
+
+
+def _spiral(count: int, rng: np.random.Generator) -> np.ndarray:
+    z = (np.arange(count) + rng.uniform(0.1, 0.9)) / count
+    phi = np.arange(count) * math.pi * (3 - math.sqrt(5)) * rng.uniform(0.5, 1.5) + rng.uniform(0, 6.3)
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
+
+
+def _band_blocks(axes: np.ndarray, order: int) -> list[np.ndarray]:
+    """The basis at the axes, (n, 2l+1) for each band l."""
+    basis = np.stack(basis_columns(*axes.T, order=order), axis=-1)
+    return [basis[:, l * l : (l + 1) ** 2] for l in range(order)]
 
 
 def sh_rotate(sh: Float[Array, "*#b k"], rotation: Float[Array, "*#b 3 3"]) -> Float[Array, "*b k"]:
@@ -130,13 +133,12 @@ def sh_rotate(sh: Float[Array, "*#b k"], rotation: Float[Array, "*#b 3 3"]) -> F
     """
     check_last_axis("rotation", rotation, 3)
     order = order_of(sh)
-    axes, analysis = (jnp.asarray(t, dtype=sh.dtype) for t in rotation_table(order))
-    turned = jnp.einsum("...ij,nj->...ni", rotation, axes)
-    basis = sh_basis(turned, order=order)
-    # Σ_i y_lm(R d_i) · analysis[i, lm'] f_lm', summed within each band: first m' then i.
-    members = jnp.asarray(np.eye(order)[bands(order)], dtype=sh.dtype)
-    per_band = jnp.einsum("...k,nk,kl->...nl", sh, analysis, members)
-    return jnp.einsum("...nk,...nl,kl->...k", basis, per_band, members)
+    axes, analysis = rotation_table(order)
+    turned = einsum("...ij,nj->...ni", rotation, jnp.asarray(axes, dtype=rotation.dtype))
+    # Σ_i y_lm(R d_i) · Σ_m' analysis[i, lm'] f_lm', band by band.
+    by_band = analysis[:, :, None] * np.eye(order)[bands(order)]
+    lobes = einsum("...k,nkl->...nl", sh, jnp.asarray(by_band, dtype=sh.dtype))
+    return jnp.sum(sh_basis(turned, order=order) * lobes[..., bands(order)], axis=-2)
 
 
 @functools.lru_cache
@@ -166,8 +168,8 @@ def sh_product(
     directions, weights = sphere_quadrature(order_a + order_b + order - 3)
     table = np.stack(basis_columns(*directions.T, order=max(order_a, order_b, order)))
     y = jnp.asarray(table, dtype=a.dtype)
-    product = (a @ y[: order_a**2]) * (b @ y[: order_b**2])
-    return (product * constant_like(weights, product)) @ y[: order**2].T
+    product = matmul(a, y[: order_a**2]) * matmul(b, y[: order_b**2])
+    return matmul(product * constant_like(weights, product), y[: order**2].T)
 
 
 def sh_convolve_zonal(sh: Float[Array, "*#b k"], kernel: Float[Array, "*#b l"]) -> Float[Array, "*b k"]:
@@ -183,8 +185,17 @@ def _sign_of_m(order: int) -> np.ndarray:
     return np.where(m % 2, -1.0, 1.0)
 
 
-# e3nn measures the polar angle from +y: its basis at (x, y, z) is the all-positive one at (z, x, y).
-_E3NN_FROM_OURS = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+@functools.lru_cache
+def _e3nn_table(order: int) -> np.ndarray:
+    """The orthogonal matrix from our coefficients to those of e3nn, ∫ y'_i y_j, by exact quadrature.
+
+    e3nn measures the polar angle from +y: its basis at (x, y, z) is the all-positive one at (z, x, y).
+    """
+    directions, weights = sphere_quadrature(2 * order - 2)
+    ours = np.stack(basis_columns(*directions.T, order=order), axis=-1)
+    theirs = np.stack(basis_columns(*np.roll(directions, 1, axis=1).T, order=order), axis=-1)
+    table = _sign_of_m(order)[:, None] * (theirs.T @ (weights[:, None] * ours))
+    return np.where(np.abs(table) < 1e-12, 0.0, table)
 
 
 def sh_to_layout(sh: Float[Array, "*b k"], layout: str) -> Float[Array, "*b k"] | Complex[Array, "*b k"]:
@@ -192,41 +203,37 @@ def sh_to_layout(sh: Float[Array, "*b k"], layout: str) -> Float[Array, "*b k"] 
 
     Args:
       layout: `gaussian_splatting` (3D Gaussian Splatting, gsplat: the same as ours), `positive` (the table
-        without the sign (-1)^m), `e3nn` (`spherical_harmonics(..., normalization="integral")`, whose polar axis is
-        y) or `scipy` (complex coefficients of `scipy.special.sph_harm_y`, index l(l+1)+m).
+        without the sign (-1)^m), `e3nn` (`spherical_harmonics(..., normalization="integral")`, whose polar
+        axis is y) or `scipy` (complex coefficients of `scipy.special.sph_harm_y`, index l(l+1)+m).
     """
     check_one_of("layout", layout, LAYOUTS)
     order = order_of(sh)
-    sign = constant_like(_sign_of_m(order), sh)
     if layout == "gaussian_splatting":
         return sh
     if layout == "positive":
-        return sh * sign
+        return sh * constant_like(_sign_of_m(order), sh)
     if layout == "e3nn":
-        return _rotate_by_constant(sh, _E3NN_FROM_OURS) * sign
+        return _times(sh, _e3nn_table(order).T)
     real, imaginary = _complex_tables(order)
-    return jax.lax.complex(sh @ jnp.asarray(real, dtype=sh.dtype), sh @ jnp.asarray(imaginary, dtype=sh.dtype))
+    return jax.lax.complex(_times(sh, real), _times(sh, imaginary))
 
 
-def sh_from_layout(
-    sh: Float[Array, "*b k"] | Complex[Array, "*b k"], layout: str
-) -> Float[Array, "*b k"]:
+def sh_from_layout(sh: Float[Array, "*b k"] | Complex[Array, "*b k"], layout: str) -> Float[Array, "*b k"]:
     """The inverse of `sh_to_layout`. From `scipy` the function is taken to be real."""
     check_one_of("layout", layout, LAYOUTS)
     order = order_of(sh)
     if layout == "gaussian_splatting":
         return sh
-    if layout == "scipy":
-        real, imaginary = _complex_tables(order)
-        x, y = jnp.real(sh), jnp.imag(sh)
-        return x @ jnp.asarray(real.T, dtype=x.dtype) + y @ jnp.asarray(imaginary.T, dtype=x.dtype)
-    positive = sh * constant_like(_sign_of_m(order), sh)
-    return positive if layout == "positive" else _rotate_by_constant(positive, _E3NN_FROM_OURS.T)
+    if layout == "positive":
+        return sh * constant_like(_sign_of_m(order), sh)
+    if layout == "e3nn":
+        return _times(sh, _e3nn_table(order))
+    real, imaginary = _complex_tables(order)
+    return _times(jnp.real(sh), real.T) + _times(jnp.imag(sh), imaginary.T)
 
 
-def _rotate_by_constant(sh, rotation: np.ndarray):
-    matrix = jnp.asarray(rotation, dtype=sh.dtype)
-    return sh_rotate(sh, jnp.broadcast_to(matrix, (*sh.shape[:-1], 3, 3)))
+def _times(sh: Float[Array, "*b k"], table: np.ndarray) -> Float[Array, "*b k"]:
+    return matmul(sh, jnp.asarray(table, dtype=sh.dtype))
 
 
 def _complex_tables(order: int) -> tuple[np.ndarray, np.ndarray]:

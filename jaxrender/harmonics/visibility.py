@@ -1,8 +1,8 @@
 """Per-vertex visibility by rays: a fixed set of directions over the hemisphere of each vertex normal.
 
-Visibility is kept as bits, one per vertex and direction, in the local frame of the vertex (z = skinned normal,
-zero below it): 32 bytes a vertex at 256 directions. Spherical harmonics, cosine-weighted transfer and shading
-truth all follow from the bits by one small matrix product.
+Visibility is kept as bits, one per vertex and direction, in the local frame of the vertex (z = skinned
+normal, zero below it): 32 bytes a vertex at 256 directions. Spherical harmonics, cosine-weighted transfer and
+shading truth all follow from the bits by one small matrix product.
 """
 
 import math
@@ -14,9 +14,10 @@ from jaxtyping import Array, Float, Int, UInt8
 from jaxrender.checks import check_at_least
 from jaxrender.harmonics.sh import basis_columns
 from jaxrender.pathtrace.embree import RAYS_PER_TASK, EmbreeScene, pool
+from jaxrender.vecmath import matmul
 
-# Distance of a ray's origin from its vertex, as a share of the mesh's diagonal. At 0 nearly every ray hits the
-# faces of its own vertex; from 5e-6 to 1.5e-3 of a body's diagonal the result changes by 2 % at most.
+# Distance of a ray's origin from its vertex, as a share of the mesh's diagonal. At 0 nearly every ray hits
+# the faces of its own vertex; from 5e-6 to 1.5e-3 of a body's diagonal the result changes by 2 % at most.
 RELATIVE_OFFSET = 1e-4
 
 
@@ -90,8 +91,7 @@ def unpack_visibility(bits: UInt8[Array, "*b bytes"], *, num_directions: int) ->
     return flags.astype(jnp.float32)
 
 
-def project_visibility(
-    bits: UInt8[Array, "*b bytes"], table: Float[Array, "d k"]
-) -> Float[Array, "*b k"]:
+def project_visibility(bits: UInt8[Array, "*b bytes"], table: Float[Array, "d k"]) -> Float[Array, "*b k"]:
     """Packed visibility to coefficients by a (d, k) table such as `projection_table`'s."""
-    return unpack_visibility(bits, num_directions=table.shape[0]) @ table
+    table = jnp.asarray(table)
+    return matmul(unpack_visibility(bits, num_directions=table.shape[0]).astype(table.dtype), table)

@@ -81,9 +81,9 @@ def phong_zh(exponent: Float[Array, "*b"], *, order: int) -> Float[Array, "*b l"
       Ramamoorthi, Hanrahan, "Frequency Space Environment Map Rendering", 2002.
     """
     check_order(order)
-    rho = [jnp.ones_like(exponent), (exponent + 1.0) / (exponent + 2.0)]
+    moments = [jnp.ones_like(exponent), (exponent + 1.0) / (exponent + 2.0)]
     for l in range(2, order):
-        rho.append(rho[l - 2] * (exponent - (l - 2.0)) / (exponent + (l + 1.0)))
+        moments.append(moments[l - 2] * (exponent - (l - 2.0)) / (exponent + (l + 1.0)))
     factors = np.sqrt((2 * np.arange(order) + 1) / (4 * math.pi))
-    rho = jnp.stack(rho[:order], axis=-1)
+    rho = jnp.stack(moments[:order], axis=-1)
     return rho * constant_like(factors, rho)

@@ -642,6 +642,75 @@ def _clip(key_times: np.ndarray, keys: dict) -> Record:
     return Record("animation.skeleton.Clip", fields, host=True)
 
 
+def _pose_model_record() -> Record:
+    g, i, k, p, c = 2, 3, 4, 6, 2
+    n = 13 * i
+    basis = {
+        "kind": "surroundings",
+        "size": 1.75,
+        "joints": np.array([0, 2, 5], dtype=np.int32),
+        "bones": np.array([1, 4], dtype=np.int32),
+        "falloff": _uniform(0, 1, g, i),
+        "reference": _unit(i, size=4),
+        "translations": _normal(i, 3),
+        "mean": _normal(g, n),
+        "basis": _normal(g, n, k),
+    }
+    model = {
+        "features": Record("harmonics.pose_model.FeatureBasis", basis),
+        "weights": 0.3 * _normal(p, k + 1, 6 * c),
+        "axes": _unit(p, c),
+        "offset": _normal(p, 16),
+        "groups": np.array([0, 1, 1, 0, 0, 1], dtype=np.int32),
+        "points": np.array([5, 4, 3, 2, 1, 0, 0], dtype=np.int32),
+        "visible": np.array([True, True, False, True, True, True]),
+    }
+    return Record("harmonics.pose_model.PoseModel", model)
+
+
+POSE_MODEL = _pose_model_record()
+
+
+def _pose_model() -> list[Case]:
+    basis = POSE_MODEL.fields["features"]
+    fields = basis.fields
+    angles = Record(basis.name, {**fields, "kind": "exponential_map"})
+    matrices = np.tile(np.eye(4), (2, len(_PARENTS), 1, 1))
+    matrices[..., :3, :] = _normal(2, len(_PARENTS), 3, 4)
+    seen = {name: fields[name] for name in ("bones", "joints", "falloff", "size")}
+    turned = {name: fields[name] for name in ("joints", "reference", "translations", "size")}
+    room = "harmonics.pose_model"
+    components = _normal(2, 4)
+    return [
+        Case(f"{room}.surroundings", {"globals": matrices[0], **seen}, gradients=("globals",)),
+        Case(f"{room}.surroundings", {"globals": matrices, **seen}, "leading axes"),
+        *(
+            Case(f"{room}.joint_angles", {"pose": _pose(2), **turned, "euler": euler}, f"euler {euler}")
+            for euler in (False, True)
+        ),
+        *(
+            Case(
+                f"{room}.raw_features",
+                {"basis": b, "pose": _pose(), "globals": matrices[0]},
+                b.fields["kind"],
+            )
+            for b in (basis, angles)
+        ),
+        Case(f"{room}.project_features", {"basis": basis, "raw": _normal(3, 2, 39)}, gradients=("raw",)),
+        Case(f"{room}.predict_numbers", {"model": POSE_MODEL, "components": components}),
+        Case(
+            f"{room}.lobes_from_numbers",
+            {"numbers": _normal(5, 12), "axes": _unit(5, 2)},
+            gradients=("numbers",),
+        ),
+        Case(
+            f"{room}.predict_lobes",
+            {"model": POSE_MODEL, "components": components},
+            gradients=("components",),
+        ),
+    ]
+
+
 def _skinning() -> list[Case]:
     v, k, p, j = 6, 3, 4, 5
     weights = _uniform(0, 1, v, k)
@@ -685,7 +754,7 @@ def _skinning() -> list[Case]:
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
-        _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility, _skeleton,
+        _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility, _pose_model, _skeleton,
         _skinning,
     )
     for case in room()

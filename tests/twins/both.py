@@ -20,6 +20,12 @@ def public(package: str, name: str) -> Any:
     return getattr(importlib.import_module(module), attribute)
 
 
+def record(value: Record, package: str, dtype: Any) -> Any:
+    """A record of a case in one package."""
+    make = jnp.asarray if package == "jaxrender" else torch.tensor
+    return _build(value, package, lambda x: make(_rounded(x, dtype)))
+
+
 def run_jax(case: Case, dtype: Any) -> tuple[Any, dict[str, np.ndarray]]:
     """The kernel's result under `jit`, and the derivatives of a fixed random mix of its outputs."""
     with jax.enable_x64(dtype == np.float64):

@@ -28,15 +28,20 @@ EXCEPTIONS = {
     "harmonics.sh.rotation_table": "a table of jaxrender's own method; the twin rotates by projection",
     "harmonics.sh.sphere_quadrature": "torchref keeps its rules in a private file",
     "harmonics.zh_fit.greedy_axes": "where jaxrender starts its search; the twin starts from a grid",
-    "harmonics.zh_fit.DAMPING": "the twin cuts singular values",
+    "harmonics.zh_fit.spread_start_axes": "the same",
+    "harmonics.zh_fit.SmallCholesky": "how jaxrender solves small systems in a batch",
+    "harmonics.pose_model.model_arrays": "files are jaxrender's to write and to check; the twin only loads one",
+    "harmonics.pose_model.read_model_file": "the same",
+    "harmonics.pose_model.model_hash": "the same",
     "harmonics.sh.triple_product_tensor": "torchref's way to the product",
     "harmonics.zh.zonal_integral": "torchref integrates where jaxrender has closed forms",
 }
 
-# Kernels with a partner that test_harmonics.py compares in a test of their own.
+# Kernels with a partner that are compared in a test of their own.
 COMPARED_APART = {
     "harmonics.zh_fit.fit_zh_lobes": "the search of each side ends at its own digits: judged by error",
     "harmonics.zh_fit.fit_shared_axes": "the same",
+    "harmonics.pose_model.load_pose_model": "reads a file",
 }
 
 

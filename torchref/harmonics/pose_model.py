@@ -142,7 +142,8 @@ def project_features(basis: FeatureBasis, raw: Float[Tensor, "*b g n"]) -> Float
 def predict_numbers(model: PoseModel, components: Float[Tensor, "g k"]) -> Float[Tensor, "p d"]:
     """The 6c numbers of each point: bias + components of its group · weights."""
     rows = [
-        w[0] + components[group] @ w[1:] for w, group in zip(model.weights, model.groups.tolist(), strict=True)
+        w[0] + components[group] @ w[1:]
+        for w, group in zip(model.weights, model.groups.tolist(), strict=True)
     ]
     return torch.stack(rows)
 
@@ -168,3 +169,20 @@ def predict_lobes(
       Nowrouzezahrai et al., "Shadowed Relighting of Dynamic Geometry with 1D BRDFs", section 4.3, step 1.
     """
     return lobes_from_numbers(predict_numbers(model, components), model.axes)
+
+
+def load_pose_model(path: str | pathlib.Path) -> tuple[PoseModel, dict]:
+    """The model in a file that jaxrender wrote, float16 arrays as float32, and its header.
+
+    The file is in the safetensors format; its metadata hold one JSON object, "header".
+    """
+    with safetensors.safe_open(path, framework="pt") as file:
+        header = json.loads(file.metadata()["header"])
+        arrays = {name: file.get_tensor(name) for name in file.keys()}
+    arrays = {name: x.float() if x.dtype == torch.float16 else x for name, x in arrays.items()}
+    features = {
+        name.removeprefix("features."): x for name, x in arrays.items() if name.startswith("features.")
+    }
+    basis = FeatureBasis(kind=header["feature_kind"], size=header["feature_size"], **features)
+    rest = {name: x for name, x in arrays.items() if not name.startswith("features.")}
+    return PoseModel(features=basis, **rest), header

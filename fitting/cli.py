@@ -1,0 +1,208 @@
+"""python -m fitting train | evaluate | relight | inspect: parses, calls the stages, prints the paths."""
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from fitting.config import BakeSettings, FitSettings, SplitSettings, TrainSettings
+from fitting.model import (
+    MODEL_FILE,
+    character_source,
+    check_same_character,
+    find_model,
+    model_header,
+    save_pose_model,
+)
+from jaxrender import cli as jaxrender_cli
+from jaxrender import console
+from jaxrender.animation.mannequin import builtin_character
+from jaxrender.animation.skinning import Character
+from jaxrender.checks import bad_input
+from jaxrender.io.atomic import write_bytes
+from jaxrender.io.character import load_character
+from jaxrender.machine import is_writable_folder
+
+Out = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
+
+
+@dataclass(frozen=True)
+class Train:
+    """Trains a pose-to-visibility model on an animated character, evaluates it, and writes model and report."""
+
+    input: tyro.conf.Positional[Path | None] = None
+    """A glTF, GLB or BVH file. Without one, the built-in character."""
+    out: Out = Path("out/train")
+    """Folder for the model, the report, the pictures and the bake; a second run continues the bake in it."""
+    num_vertices: int = 5000
+    """Vertices of the mannequin that is grown around a skeleton without a body."""
+    bake: BakeSettings = field(default_factory=BakeSettings)
+    split: SplitSettings = field(default_factory=SplitSettings)
+    fit: FitSettings = field(default_factory=FitSettings)
+    study: bool = True
+    """Compare with the paper's methods and the baselines on a sample of points; takes a minute or two."""
+    json: bool = False
+    """Print one JSON object instead of the list of files."""
+
+    def run(self) -> None:
+        console.enable_compilation_cache()
+        settings = TrainSettings(self.bake, self.split, self.fit)
+        character = open_character(self.input, self.num_vertices)
+        train_and_report(
+            character, settings, self.out, source=self.input, num_vertices=self.num_vertices, study=self.study,
+            as_json=self.json,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Evaluates a trained model again: errors on held-out motion, comparisons, and the report."""
+
+    model: tyro.conf.Positional[Path]
+    """The folder of a training run."""
+    study: bool = True
+    """Compare with the paper's methods and the baselines on a sample of points."""
+    json: bool = False
+    """Print one JSON object instead of the list of files."""
+
+    def run(self) -> None:
+        console.enable_compilation_cache()
+        _, header, file = find_model(self.model)
+        settings = settings_from_header(header, file)
+        settings = dataclasses.replace(settings, fit=dataclasses.replace(settings.fit, ridge=header["ridge"]))
+        source = header["source"]
+        character = open_character(Path(source["input"]) if source["input"] else None, source["num_vertices"])
+        check_same_character(character, header, file)
+        train_and_report(
+            character, settings, file.parent, source=source["input"], num_vertices=source["num_vertices"],
+            study=self.study, as_json=self.json,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Prints what a model file holds: character, settings, errors, arrays and sizes."""
+
+    model: tyro.conf.Positional[Path]
+    """A model file, or the folder of a training run."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        model, header, file = find_model(self.model)
+        arrays = {name: f"{value.dtype} {tuple(value.shape)}" for name, value in _arrays(model).items()}
+        size = file.stat().st_size
+        if self.json:
+            console.print_json({"file": file, "bytes": size, "header": header, "arrays": arrays})
+            return
+        print(f"{file}  {console.format_bytes(size)}")
+        print(json.dumps(header, indent=2))
+        for name, text in arrays.items():
+            print(f"{name:24} {text}")
+
+
+def _arrays(model) -> dict[str, np.ndarray]:
+    from jaxrender.harmonics.pose_model import model_arrays
+
+    return model_arrays(model)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command; returns the exit status."""
+    commands = Train | Evaluate | jaxrender_cli.Relight | Inspect
+
+    def command() -> None:
+        console.parse(commands, prog="python -m fitting", description=__doc__, argv=argv).run()
+
+    return console.run_command(command)
+
+
+def open_character(path: Path | None, num_vertices: int) -> Character:
+    """The character of a file, or the built-in one; says what was repaired."""
+    character = builtin_character(num_vertices=num_vertices) if path is None else load_character(
+        path, num_vertices=num_vertices
+    )  # fmt: skip
+    for note in character.notes:
+        console.announce(f"{character.name}: {note}")
+    return character
+
+
+def settings_from_header(header: dict, file: Path) -> TrainSettings:
+    """The settings a model was trained with."""
+    stored = header.get("settings", {})
+    try:
+        split = {**stored["split"], "clips": tuple(stored["split"]["clips"])}
+        return TrainSettings(BakeSettings(**stored["bake"]), SplitSettings(**split), FitSettings(**stored["fit"]))
+    except (KeyError, TypeError, AttributeError) as error:
+        bad_input(file, "settings", expected="the settings of a training run", got=str(error))
+
+
+def train_and_report(
+    character: Character, settings: TrainSettings, out: Path, *, source, num_vertices: int, study: bool, as_json: bool
+) -> None:
+    """The main job: bake, fit, evaluate, pictures, report. Everything heavy is imported here, after the cache is on."""
+    from fitting.evaluate import evaluate
+    from fitting.report import write_report
+    from fitting.train import train_character
+
+    if not is_writable_folder(out):
+        bad_input("-o", str(out), expected="a folder that can be written", got="one that cannot")
+    console.announce_device(rays="Embree")
+
+    def track(items, count, label):
+        return console.track(items, label, total=count)
+
+    with console.keeping(f"the frames baked so far are in {out}; the same command continues"):
+        result = train_character(character, settings, out, track=track)
+        if settings.fit.num_lobes and as_json is False:
+            console.announce(
+                f"ridge {result.ridge:g}; {result.bake.rays_per_second / 1e6:.1f} M rays/s; "
+                f"{int((~np.asarray(result.model.visible)).sum())} of {len(result.model.visible)} points see nothing"
+            )
+        console.announce("evaluating ...")
+        with result.timings.stage("evaluate"):
+            evaluation = evaluate(result.data, result.model, settings.fit, ridge=result.ridge, study=study, track=track)
+        found = character_source(character, Path(source) if source else None, num_vertices)
+        header = model_header(result, settings, source=found, errors=evaluation.summary())
+        model_path = out / MODEL_FILE
+        save_pose_model(model_path, result.model, header)
+        write_bytes(out / "evaluation.json", json.dumps(console.to_jsonable(evaluation.as_dict())).encode())
+        console.announce("drawing ...")
+        report = write_report(out, character, result, settings, evaluation, model_path)
+    record = {"errors": header["errors"], "ridge": result.ridge, "seconds": result.timings.seconds}
+    console.finish(paths=[model_path, out / "evaluation.json", *report], record=record, as_json=as_json)
+
+
+def run_demo(options) -> None:
+    """`jaxrender demo`: the built-in character, small enough for two cores and five minutes."""
+    settings = TrainSettings(
+        BakeSettings(max_frames=150, num_mixed=120, max_points=2000, seed=options.seed),
+        SplitSettings(),
+        FitSettings(num_components=32, refine_steps=18),
+    )
+    train_and_report(
+        open_character(None, 5000), settings, options.out, source=None, num_vertices=5000, study=False,
+        as_json=options.json,
+    )  # fmt: skip
+
+
+def run_relight(options) -> None:
+    """`jaxrender relight` and `python -m fitting relight`: a clip under turning light."""
+    from fitting.relight import render_clip
+
+    if options.model is None:
+        demo = Path("out/demo")
+        if not (demo / MODEL_FILE).is_file():
+            console.announce(f"no model given: training the built-in character into {demo} first")
+            run_demo(jaxrender_cli.Demo(out=demo, seed=options.seed))
+        options = dataclasses.replace(options, model=demo)
+    model, header, file = find_model(options.model)
+    source = header["source"]
+    character = open_character(Path(source["input"]) if source["input"] else None, source["num_vertices"])
+    check_same_character(character, header, file)
+    paths = render_clip(character, model, options)
+    console.finish(paths=paths, record={"model": str(file)}, as_json=options.json)
