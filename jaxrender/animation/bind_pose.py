@@ -51,16 +51,17 @@ def spread_limbs(
     parents: Sequence[int],
     body: Landmarks | None,
     *,
-    thickness: float = 0.0,
+    step: float = 0.0,
 ) -> Float[np.ndarray, "j 4 4"]:
     """World from joint with arms and legs of a human at an angle, or the bones of any other tree apart.
 
     Args:
-      thickness: radius that every bone of a tree takes at least.
+      step: spacing of the grid the body is meshed on. Bones of a tree take a radius of one step at least, and
+        keep a gap of 1.3 steps, which a grid can show.
     """
     hanging = _hanging(parents)
     if body is None:
-        return _push_apart(rest, parents, hanging, thickness)
+        return _push_apart(rest, parents, hanging, step)
     matrices = rest.copy()
     positions = rest[:, :3, 3]
     hips, shoulders = middle(positions, body.thigh), middle(positions, body.upper_arm)
@@ -116,7 +117,7 @@ def _turn_joint(matrices: np.ndarray, hanging: np.ndarray, joint: int, turn: np.
 
 
 def _push_apart(
-    rest: np.ndarray, parents: Sequence[int], hanging: np.ndarray, thickness: float, num_rounds: int = 60
+    rest: np.ndarray, parents: Sequence[int], hanging: np.ndarray, step: float, num_rounds: int = 60
 ) -> Float[np.ndarray, "j 4 4"]:
     """Bones that lie closer than their thickness allows, although far apart along the tree, are turned away.
 
@@ -134,7 +135,7 @@ def _push_apart(
         return rest
     starts = np.asarray(parents)[ends]
     parts = tree_parts(positions, parents)
-    radius = np.array([max(part.radius_a, part.radius_b, thickness) for part in parts])
+    radius = np.array([max(part.radius_a, part.radius_b, step) for part in parts])
 
     # Points on the bones; which bones they must keep away from, and by how much.
     share = np.tile([0.0, 0.5, 1.0], len(ends))
@@ -145,7 +146,8 @@ def _push_apart(
         share[:, None] * lengths[ends][of_bone, None] + to_ends[starts[of_bone]],
         (1.0 - share[:, None]) * lengths[ends][of_bone, None] + to_ends[ends[of_bone]],
     )
-    needed = 1.15 * (radius[of_bone, None] + radius) + 0.01 * extent
+    needed = radius[of_bone, None] + radius
+    needed = needed + np.maximum(0.15 * needed + 0.01 * extent, 1.3 * step)
     watched = along > 2.0 * needed
 
     # Inertia of a joint: what hangs on it.

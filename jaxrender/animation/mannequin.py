@@ -54,10 +54,10 @@ def grow_mannequin(
     roles = recognize(skeleton.names, parents)
     landmarks = find_landmarks(parents, roles)
 
-    # Coarse meshes have thick limbs, which must be further apart.
+    # A coarse grid makes limbs thick and joins those with a small gap: they must be further apart.
     hops = joint_hops(rest[:, :3, 3], parents)
     step = grid_step(assemble(tree_parts(rest[:, :3, 3], parents), hops), num_vertices)
-    bind = spread_limbs(rest, parents, landmarks, thickness=step)
+    bind = spread_limbs(rest, parents, landmarks, step=step)
     positions = bind[:, :3, 3]
     parts = human_parts(positions, parents, roles, landmarks) if landmarks is not None else None
     body = assemble(parts or tree_parts(positions, parents), hops)

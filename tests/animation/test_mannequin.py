@@ -141,7 +141,7 @@ def check_shape(mesh, normals):
     smallest = np.degrees(np.arccos(np.clip(cosines, -1, 1)).min(axis=1))
     # Marching cubes alone leaves slivers: a first percentile of some 5 degrees and a median near 35.
     assert np.median(smallest) > 42 and np.percentile(smallest, 1) > 18 and smallest.min() > 1
-    # A tip as thin as the mesh is coarse has a few faces at more than 78 degrees to the mean of their fellows.
+    # A tip as thin as the mesh is coarse has a few faces at more than 78 degrees to their mean.
     agreement = np.einsum("tki,ti->tk", np.asarray(normals, dtype=np.float64)[mesh.faces], mesh.face_normals)
     assert np.mean(agreement > 0.2) > 0.99
 

@@ -754,8 +754,8 @@ def _skinning() -> list[Case]:
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
-        _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility, _pose_model, _skeleton,
-        _skinning,
+        _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility, _pose_model,
+        _skeleton, _skinning,
     )
     for case in room()
 )  # fmt: skip

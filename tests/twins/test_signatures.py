@@ -30,7 +30,7 @@ EXCEPTIONS = {
     "harmonics.zh_fit.greedy_axes": "where jaxrender starts its search; the twin starts from a grid",
     "harmonics.zh_fit.spread_start_axes": "the same",
     "harmonics.zh_fit.SmallCholesky": "how jaxrender solves small systems in a batch",
-    "harmonics.pose_model.model_arrays": "files are jaxrender's to write and to check; the twin only loads one",
+    "harmonics.pose_model.model_arrays": "jaxrender writes and checks files; the twin only loads",
     "harmonics.pose_model.read_model_file": "the same",
     "harmonics.pose_model.model_hash": "the same",
     "harmonics.sh.triple_product_tensor": "torchref's way to the product",

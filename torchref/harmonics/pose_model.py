@@ -1,7 +1,6 @@
-"""The run-time model of a character: pose features to zonal lobes of visibility, step 1 of the run-time steps.
+"""The run-time model of a character: pose features to zonal lobes of visibility, step 1 of the run time.
 
-One point, one group, one joint at a time. Reading and checking of model files is the partner's; `load_pose_model`
-here trusts the file.
+One point, one group, one joint at a time. Checking model files is the partner's; `load_pose_model` trusts them.
 """
 
 import json
@@ -28,7 +27,7 @@ from torchref.vecmath import normalize, safe_sqrt
 
 @dataclass(frozen=True)
 class FeatureBasis:
-    """How a pose becomes k components for each of g groups: raw features, minus their mean, on principal axes."""
+    """How a pose becomes k components for each of g groups: raw features - mean, on principal axes."""
 
     kind: Literal["surroundings", "exponential_map", "euler", "given"]
     size: float
@@ -43,9 +42,10 @@ class FeatureBasis:
 
 @dataclass(frozen=True)
 class PoseModel:
-    """What predicts visibility. Of the 6c columns of `weights` the first 2c are chart coordinates, lobe by lobe.
+    """What predicts visibility.
 
-    Row 0 of the weights is the bias; `groups[p]` is the group of point p, `points[v]` the point of mesh vertex v.
+    Of the 6c columns of `weights` the first 2c are chart coordinates, lobe by lobe; row 0 is the bias.
+    `groups[p]` is the group of point p, `points[v]` the point of mesh vertex v.
     """
 
     features: FeatureBasis
@@ -66,7 +66,7 @@ def surroundings(
     falloff: Float[Tensor, "g i"],
     size: float,
 ) -> Float[Tensor, "*b g n"]:
-    """Where the other joints are, and how they are turned, in the frame of each bone: 3 + 1 + 9 numbers a joint.
+    """Where the other joints are, and how turned, in the frame of each bone: 3 + 1 + 9 numbers a joint.
 
     Frames are the columns of the joint matrices, made unit. With p the place of a joint in the bone's frame,
     r = |p| and a = size/9: a p / (r² + a²), a / (2r + a), and a quarter of the joint's axes times `falloff`.
@@ -172,14 +172,13 @@ def predict_lobes(
 
 
 def load_pose_model(path: str | pathlib.Path) -> tuple[PoseModel, dict]:
-    """The model in a file that jaxrender wrote, float16 arrays as float32, and its header.
+    """The model in a file that jaxrender wrote, and its header.
 
     The file is in the safetensors format; its metadata hold one JSON object, "header".
     """
     with safetensors.safe_open(path, framework="pt") as file:
         header = json.loads(file.metadata()["header"])
         arrays = {name: file.get_tensor(name) for name in file.keys()}
-    arrays = {name: x.float() if x.dtype == torch.float16 else x for name, x in arrays.items()}
     features = {
         name.removeprefix("features."): x for name, x in arrays.items() if name.startswith("features.")
     }
