@@ -145,12 +145,13 @@ def train_and_report(
     character: Character, settings: TrainSettings, out: Path, *, source, num_vertices: int, study: bool, as_json: bool
 ) -> None:
     """The main job: bake, fit, evaluate, pictures, report. Everything heavy is imported here, after the cache is on."""
+    if not is_writable_folder(out):
+        bad_input("-o", str(out), expected="a folder that can be written", got="one that cannot")
     from fitting.evaluate import evaluate
+    from fitting.pictures import draw_pictures
     from fitting.report import write_report
     from fitting.train import train_character
 
-    if not is_writable_folder(out):
-        bad_input("-o", str(out), expected="a folder that can be written", got="one that cannot")
     console.announce_device(rays="Embree")
 
     def track(items, count, label):
@@ -165,16 +166,31 @@ def train_and_report(
             )
         console.announce("evaluating ...")
         with result.timings.stage("evaluate"):
-            evaluation = evaluate(result.data, result.model, settings.fit, ridge=result.ridge, study=study, track=track)
+            evaluation = evaluate(
+                result.data, result.model, settings.fit, ridge=result.ridge, study=study, track=track,
+                angles=joint_angle_features(character, result.motion) if study else None,
+                clip_names=result.motion.clip_names,
+            )  # fmt: skip
         found = character_source(character, Path(source) if source else None, num_vertices)
         header = model_header(result, settings, source=found, errors=evaluation.summary())
-        model_path = out / MODEL_FILE
+        model_path, numbers_path = out / MODEL_FILE, out / "evaluation.json"
         save_pose_model(model_path, result.model, header)
-        write_bytes(out / "evaluation.json", json.dumps(console.to_jsonable(evaluation.as_dict())).encode())
+        write_bytes(numbers_path, json.dumps(console.to_jsonable(evaluation.as_dict())).encode())
         console.announce("drawing ...")
-        report = write_report(out, character, result, settings, evaluation, model_path)
+        with result.timings.stage("pictures"):
+            pictures = draw_pictures(character, result, evaluation, out)
+        report = write_report(out, result, settings, evaluation, model_path, pictures)
     record = {"errors": header["errors"], "ridge": result.ridge, "seconds": result.timings.seconds}
-    console.finish(paths=[model_path, out / "evaluation.json", *report], record=record, as_json=as_json)
+    paths = [model_path, numbers_path, *(path for path, _ in pictures), report]
+    console.finish(paths=paths, record=record, as_json=as_json)
+
+
+def joint_angle_features(character: Character, motion):
+    """Exponential-map features of the same frames, for the study."""
+    from fitting.features import all_raw_features, unfitted_basis
+
+    basis = unfitted_basis(character, motion, "exponential_map", np.zeros(1, np.int32))
+    return all_raw_features(basis, character, motion), basis
 
 
 def run_demo(options) -> None:
@@ -192,7 +208,7 @@ def run_demo(options) -> None:
 
 def run_relight(options) -> None:
     """`jaxrender relight` and `python -m fitting relight`: a clip under turning light."""
-    from fitting.relight import render_clip
+    from fitting.pictures import render_clip
 
     if options.model is None:
         demo = Path("out/demo")

@@ -43,7 +43,8 @@ class SplitSettings:
 
     def __post_init__(self) -> None:
         check_at_least("segment_share", self.segment_share, 0.0)
-        check_at_least("0.9 - segment_share", 0.9 - self.segment_share, 0.0)
+        if self.segment_share > 0.9:
+            raise ValueError(f"segment_share: expected at most 0.9, got {self.segment_share}")
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,7 @@ class FitSettings:
     """Store the pose matrices in float16."""
 
     def __post_init__(self) -> None:
-        check_at_least("num_lobes", self.num_lobes, 1)
-        check_at_least("3 - num_lobes", 3 - self.num_lobes, 0)
+        check_one_of("num_lobes", self.num_lobes, (1, 2, 3))
         check_at_least("num_components", self.num_components, 1)
         check_at_least("refine_steps", self.refine_steps, 0)
         check_one_of("features", self.features, ("surroundings", "exponential_map", "euler"))

@@ -18,5 +18,7 @@ from jaxrender.camera import Camera as Camera
 from jaxrender.checks import InputError as InputError
 from jaxrender.scene import Mesh as Mesh
 from jaxrender.scene import MeshSequence as MeshSequence
+from jaxrender.scene import make_mesh_sequence as make_mesh_sequence
+from jaxrender.scene import vertex_normals as vertex_normals
 
 __version__ = "0.1.0"

@@ -20,11 +20,7 @@ def in_float64(kernel: Kernel) -> Kernel:
     @functools.wraps(kernel)
     def rounded(*args, **kwargs):
         given = [t for x in (*args, *kwargs.values()) for t in _tensors(x)]
-        came = [
-            t.real.dtype if t.is_complex() else t.dtype
-            for t in given
-            if t.is_floating_point() or t.is_complex()
-        ]
+        came = [t.real.dtype if t.is_complex() else t.dtype for t in given if t.is_floating_point() or t.is_complex()]
         if came:
             dtype = functools.reduce(torch.promote_types, came)
         else:

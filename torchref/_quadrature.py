@@ -28,16 +28,13 @@ def gauss_jacobi(exponent: Float[Tensor, "*b"], num_nodes: int) -> tuple[Tensor,
       (1-t)^0 (1+t)^α moved from [-1, 1] to [0, 1].
     """
     alpha = exponent[..., None]
-    k = torch.arange(num_nodes, dtype=exponent.dtype, device=exponent.device).expand(
-        *exponent.shape, num_nodes
-    )
+    k = torch.arange(num_nodes, dtype=exponent.dtype, device=exponent.device).expand(*exponent.shape, num_nodes)
     later = k[..., 1:]
     first = 1.0 / (alpha + 2.0)  # the general term is 0/0 at k = 0, α = 0
     diagonal = torch.cat(
         [
             first,
-            (2.0 * later * (later + alpha + 1.0) + alpha)
-            / ((2.0 * later + alpha) * (2.0 * later + alpha + 2.0)),
+            (2.0 * later * (later + alpha + 1.0) + alpha) / ((2.0 * later + alpha) * (2.0 * later + alpha + 2.0)),
         ],
         dim=-1,
     )
@@ -46,9 +43,7 @@ def gauss_jacobi(exponent: Float[Tensor, "*b"], num_nodes: int) -> tuple[Tensor,
         * (later + alpha)
         / ((2.0 * later + alpha) * torch.sqrt((2.0 * later + alpha + 1.0) * (2.0 * later + alpha - 1.0)))
     )
-    matrix = (
-        torch.diag_embed(diagonal) - torch.diag_embed(beside, offset=1) - torch.diag_embed(beside, offset=-1)
-    )
+    matrix = torch.diag_embed(diagonal) - torch.diag_embed(beside, offset=1) - torch.diag_embed(beside, offset=-1)
     u, vectors = torch.linalg.eigh(matrix)
     return u, vectors[..., 0, :] ** 2 / (alpha + 1.0)
 
@@ -59,8 +54,6 @@ def sphere(degree: int, device: torch.device) -> tuple[Float[Tensor, "q 3"], Flo
     num_azimuths = degree + 1
     phi = 2.0 * np.pi * (np.arange(num_azimuths) + 0.5) / num_azimuths
     s = np.sqrt((1.0 - z) * (1.0 + z))
-    directions = np.stack(
-        [np.outer(s, np.cos(phi)), np.outer(s, np.sin(phi)), np.outer(z, np.ones_like(phi))], axis=-1
-    )
+    directions = np.stack([np.outer(s, np.cos(phi)), np.outer(s, np.sin(phi)), np.outer(z, np.ones_like(phi))], axis=-1)
     weights = np.repeat(w, num_azimuths) * (2.0 * np.pi / num_azimuths)
     return torch.as_tensor(directions.reshape(-1, 3), device=device), torch.as_tensor(weights, device=device)

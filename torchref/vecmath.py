@@ -49,9 +49,7 @@ def orthonormal_tangent(n: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
 
 
 @in_float64
-def frame_from_normal_tangent(
-    normal: Float[Tensor, "*b 3"], tangent: Float[Tensor, "*b 3"]
-) -> Float[Tensor, "*b 3 3"]:
+def frame_from_normal_tangent(normal: Float[Tensor, "*b 3"], tangent: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """World-from-local rotation with columns tangent, bitangent, normal.
 
     The tangent is first made orthogonal to the unit normal; one parallel to it, that is with less than 1e-12

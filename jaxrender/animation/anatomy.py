@@ -146,9 +146,7 @@ def find_landmarks(parents: Sequence[int], roles: Sequence[Role | None]) -> Land
     )
 
 
-def stature(
-    positions: Float[np.ndarray, "j 3"], parents: Sequence[int], roles: Sequence[Role | None]
-) -> float | None:
+def stature(positions: Float[np.ndarray, "j 3"], parents: Sequence[int], roles: Sequence[Role | None]) -> float | None:
     """Body height by the length of the legs, in the units of `positions`; None if this is no upright human.
 
     References:

@@ -76,9 +76,7 @@ def spread_limbs(
     return matrices
 
 
-def _spread_turn(
-    limb: np.ndarray, down: np.ndarray, outward: np.ndarray, degrees: tuple[float, float]
-) -> np.ndarray:
+def _spread_turn(limb: np.ndarray, down: np.ndarray, outward: np.ndarray, degrees: tuple[float, float]) -> np.ndarray:
     """Rotation vector that brings the angle between a limb and straight down within limits."""
     if min(np.linalg.norm(limb), np.linalg.norm(down)) == 0:
         return np.zeros(3)
@@ -126,9 +124,7 @@ def _push_apart(
     over. A tree that cannot be freed keeps some contacts.
     """
     positions = rest[:, :3, 3]
-    lengths = np.array(
-        [np.linalg.norm(positions[j] - positions[p]) if p >= 0 else 0.0 for j, p in enumerate(parents)]
-    )
+    lengths = np.array([np.linalg.norm(positions[j] - positions[p]) if p >= 0 else 0.0 for j, p in enumerate(parents)])
     extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
     ends = np.flatnonzero(lengths > 1e-9 * extent)
     if extent == 0 or not 2 <= len(ends) <= _MAX_BONES:

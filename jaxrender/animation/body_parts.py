@@ -68,9 +68,7 @@ def tree_parts(positions: Float[np.ndarray, "j 3"], parents: Sequence[int]) -> l
         heading = (positions[joint] - positions[parent]) / lengths[joint]
         straight = before is not None and heading @ unit(before.b - before.a) > 0.9
         group = before.group if before is not None and straight else joint
-        parts[joint] = Part(
-            parent, positions[parent], positions[joint], start, end, group, 0.3 * end, sideways
-        )
+        parts[joint] = Part(parent, positions[parent], positions[joint], start, end, group, 0.3 * end, sideways)
     return list(parts.values())
 
 

@@ -110,9 +110,7 @@ def part_distances(body: Body, points: Float[np.ndarray, "n 3"]) -> tuple[Float[
     # Every array here is (n, p): a third axis for x, y and z would take three times the time.
     along = points @ body.axis.T - np.sum(body.origin * body.axis, axis=1)
     sideways = points @ body.wide.T - np.sum(body.origin * body.wide, axis=1)
-    square = (
-        np.sum(points**2, axis=1)[:, None] - 2.0 * points @ body.origin.T + np.sum(body.origin**2, axis=1)
-    )
+    square = np.sum(points**2, axis=1)[:, None] - 2.0 * points @ body.origin.T + np.sum(body.origin**2, axis=1)
     rest2 = np.maximum(square - along**2 - sideways**2, 0.0)
     length = np.maximum(body.length, 1e-12)
     share = np.clip(along / length, 0.0, 1.0)
@@ -134,9 +132,7 @@ def part_distances(body: Body, points: Float[np.ndarray, "n 3"]) -> tuple[Float[
     return (rho - radius) / steepness, scale, (beyond - along) * scale, (pull - sideways) * scale
 
 
-def evaluate(
-    body: Body, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+def evaluate(body: Body, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
     """The field f and a vector close to its gradient (exactly so on a single part)."""
     value, gradient = np.empty(len(points)), np.empty((len(points), 3))
     # Points are taken cell by cell, with the parts that matter in the cell; few parts need no cells.
@@ -189,9 +185,7 @@ def _melt(body: Body, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 # The mesh.
 
 
-def mesh_body(
-    body: Body, *, num_vertices: int
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"], Body]:
+def mesh_body(body: Body, *, num_vertices: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"], Body]:
     """A closed mesh with about `num_vertices` vertices (within 10 %), well-shaped triangles, outside seen
     counter-clockwise; and the body it is the mesh of, whose parts are at least as thick as its grid.
 
@@ -258,14 +252,15 @@ def _march(body: Body, step: float) -> tuple[np.ndarray, np.ndarray]:
     return _drop_crumbs(origin + step * vertices.astype(np.float64), faces.astype(np.int64))
 
 
-def _sample_grid(
-    body: Body, origin: np.ndarray, step: float, counts: np.ndarray, block: int = 4
-) -> np.ndarray:
+def _sample_grid(body: Body, origin: np.ndarray, step: float, counts: np.ndarray, block: int = 4) -> np.ndarray:
     """The field on a grid; in blocks far from the surface, the value in the middle of the block."""
     blocks = -(-counts // block)
     corners = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), axis=-1).reshape(-1, 3) * block
-    middle, _ = evaluate(body, origin + step * (corners + 0.5 * (block - 1)))
-    near = np.abs(middle) < 0.5 * np.sqrt(3.0) * block * step * 1.2 + body.blend.max()
+    # By the distance to the nearest part: f itself is no distance far from the surface.
+    centers = origin + step * (corners + 0.5 * (block - 1))
+    chunks = np.array_split(centers, -(-len(centers) * len(body.joints) // 15000))
+    middle = np.concatenate([part_distances(body, chunk)[0].min(axis=1) for chunk in chunks])
+    near = np.abs(middle) < 0.5 * np.sqrt(3.0) * block * step * 1.2 + 2.0 * body.blend.max()
     values = np.repeat(middle.astype(np.float32)[:, None], block**3, axis=1)
     cells = np.stack(np.meshgrid(*[np.arange(block)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     points = origin + step * (corners[near][:, None] + cells)

@@ -90,9 +90,7 @@ def _walk() -> Clip:
     times = np.arange(round(num_cycles * _CYCLE * FRAMES_PER_SECOND) + 1) / FRAMES_PER_SECOND
     phase = times / _CYCLE
     once, twice = 2 * np.pi * phase, 4 * np.pi * phase
-    hips = np.stack(
-        [0.02 * np.cos(once - 0.6 * np.pi), -0.024 - 0.017 * np.cos(twice - 0.6), 0 * times], axis=-1
-    )
+    hips = np.stack([0.02 * np.cos(once - 0.6 * np.pi), -0.024 - 0.017 * np.cos(twice - 0.6), 0 * times], axis=-1)
     # At phase 0 the left heel strikes: left hip and right shoulder are ahead.
     turns = {
         "Hips": _degrees(3.0, -6.0 * np.cos(once), 3.0 * np.sin(once)),
@@ -151,7 +149,7 @@ def _turn() -> Clip:
     keys = np.array([0.0, 0.8, 1.6, 2.4, 3.2])
     yaw = np.array([0.0, 1.0, 0.0, -1.0, 0.0])
 
-    def turned(degrees: float, pitch: Sequence[float] = (0, 0, 0, 0, 0), roll: float = 0.0) -> Rotation:
+    def turned(degrees: float, pitch: Sequence[int] = (0, 0, 0, 0, 0), roll: float = 0.0) -> Rotation:
         return _keyed(times, keys, _degrees(np.asarray(pitch, float), degrees * yaw, roll * yaw))
 
     turns = {
@@ -176,7 +174,7 @@ def _reach() -> Clip:
     times = np.arange(4 * FRAMES_PER_SECOND + 1) / FRAMES_PER_SECOND
     keys = np.array([0.0, 0.8, 1.6, 2.4, 3.2, 4.0])
 
-    def bent(*pitch_yaw: tuple[float, float]) -> Rotation:
+    def bent(*pitch_yaw: tuple[int, int]) -> Rotation:
         values = np.asarray([(0, 0), *pitch_yaw, (0, 0)], dtype=np.float64)
         return _keyed(times, keys, _degrees(values[:, 0], values[:, 1], 0.0))
 
@@ -293,9 +291,7 @@ def _clip(
     return Clip(name, tuple(channels), 0.0, float(times[-1]))
 
 
-def _leg(
-    side: str, hips: np.ndarray, pelvis: Rotation, ankle: np.ndarray, foot: Rotation
-) -> dict[str, Rotation]:
+def _leg(side: str, hips: np.ndarray, pelvis: Rotation, ankle: np.ndarray, foot: Rotation) -> dict[str, Rotation]:
     """Turns of thigh, shin and foot that put the ankle in its place, the knee ahead.
 
     Two-bone inverse kinematics; an ankle out of reach is met in direction only.

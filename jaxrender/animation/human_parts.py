@@ -76,9 +76,7 @@ def human_parts(
 class _Human:
     """Collects `parts`; one method for each region of the body."""
 
-    def __init__(
-        self, positions: np.ndarray, parents: Sequence[int], roles: Sequence[Role | None], body: Landmarks
-    ):
+    def __init__(self, positions: np.ndarray, parents: Sequence[int], roles: Sequence[Role | None], body: Landmarks):
         self.positions, self.parents, self.roles, self.body = positions, parents, roles, body
         self.children: list[list[int]] = [[] for _ in parents]
         for joint, parent in enumerate(parents):
@@ -176,9 +174,7 @@ class _Human:
         u, up, body = self.trunk_size, self.up, self.body
         column = self.shoulders - self.hips
         share = np.linspace(_TRUNK_PROFILE[0, 0], _TRUNK_PROFILE[-1, 0], 13)
-        half_width, half_depth, ahead = (
-            u * PchipInterpolator(_TRUNK_PROFILE[:, 0], _TRUNK_PROFILE[:, 1:])(share).T
-        )
+        half_width, half_depth, ahead = u * PchipInterpolator(_TRUNK_PROFILE[:, 0], _TRUNK_PROFILE[:, 1:])(share).T
         hips, shoulders = (
             float(np.linalg.norm(self.positions[pair["left"]] - self.positions[pair["right"]]))
             for pair in (body.thigh, body.upper_arm)
@@ -199,9 +195,7 @@ class _Human:
             seat = self.positions[body.thigh[side]] + u * (-0.040 * self.ahead - 0.006 * outward - 0.01 * up)
             self.add(body.pelvis, seat, seat + 0.03 * u * up, (0.080 * u, 0.076 * u), blend=0.025 * u)
             shoulder = self.positions[body.upper_arm[side]]
-            collar = (
-                self.shoulders + 0.25 * (shoulder - self.shoulders) + u * (0.025 * up - 0.012 * self.ahead)
-            )
+            collar = self.shoulders + 0.25 * (shoulder - self.shoulders) + u * (0.025 * up - 0.012 * self.ahead)
             joint = self.parents[body.upper_arm[side]]
             self.add(joint, collar, shoulder, (0.046 * u, 0.050 * u), blend=0.03 * u)
             flank = self.hips + 0.70 * column + 0.085 * u * outward
@@ -231,18 +225,12 @@ class _Human:
         blend = 0.015 * u
         self.add(body.head, place(0.110, -0.022), place(0.112, 0.020), (0.077 * u, 0.073 * u), blend=blend)
         jaw, chin = place(0.040, 0.004), place(0.020, 0.050)
-        self.add(
-            body.head, place(0.117, -0.002), jaw, (0.079 * u, 0.052 * u), stretch=(1.0, 1.1), blend=blend
-        )
-        self.add(
-            body.head, place(0.105, 0.026), chin, (0.067 * u, 0.042 * u), stretch=(1.0, 1.25), blend=blend
-        )
+        self.add(body.head, place(0.117, -0.002), jaw, (0.079 * u, 0.052 * u), stretch=(1.0, 1.1), blend=blend)
+        self.add(body.head, place(0.105, 0.026), chin, (0.067 * u, 0.042 * u), stretch=(1.0, 1.25), blend=blend)
 
     def arm(self, side: str) -> None:
         body, u = self.body, self.arm_size
-        self.limb(
-            (body.upper_arm[side], body.forearm[side], body.hand[side]), _ARM_PROFILE, u, blend=0.014 * u
-        )
+        self.limb((body.upper_arm[side], body.forearm[side], body.hand[side]), _ARM_PROFILE, u, blend=0.014 * u)
 
     def leg(self, side: str) -> None:
         body, u = self.body, self.leg_size
@@ -267,9 +255,7 @@ class _Human:
             stops = stops[(stops >= low) & (stops <= high)]
             radii, ahead = u * curve(stops).T
             on_bone = np.stack([np.interp(stops, way, points[:, axis]) for axis in range(3)], axis=-1)
-            owners = [
-                chain[np.searchsorted(way, s, side="right") - 1] for s in 0.5 * (stops[1:] + stops[:-1])
-            ]
+            owners = [chain[np.searchsorted(way, s, side="right") - 1] for s in 0.5 * (stops[1:] + stops[:-1])]
             centers = on_bone + ahead[:, None] * self.ahead
             self.loft(centers, owners, radii, np.ones(len(stops)), blend=blend)
 
@@ -302,9 +288,7 @@ class _Human:
             for chain in fingers:
                 self.finger(hand, knuckles, chain, 0.0095 * u, reach=0.06 * u)
         else:
-            owner = next(
-                (joint for chain in fingers for joint in reversed(chain) if not self.is_tip(joint)), hand
-            )
+            owner = next((joint for chain in fingers for joint in reversed(chain) if not self.is_tip(joint)), hand)
             tip = wrist + (length - 0.012 * u) * along
             self.add(
                 owner,
@@ -358,9 +342,7 @@ class _Human:
         u, foot = self.leg_size, self.body.foot[side]
         ankle = self.positions[foot]
         shin = unit(ankle - self.positions[self.body.shin[side]])
-        toe = next(
-            (c for c in self.children[foot] if (r := self.roles[c]) is not None and r.part == "toe"), None
-        )
+        toe = next((c for c in self.children[foot] if (r := self.roles[c]) is not None and r.part == "toe"), None)
         ball_joint = self.positions[toe] if toe is not None else self.tip_below(foot)
         ahead = ball_joint - ankle if ball_joint is not None else self.ahead
         along = unit_across(shin, ahead, self.ahead)
@@ -379,11 +361,9 @@ class _Human:
         self.add(foot, ankle, heel, (0.035 * u, 0.032 * u), blend=blend)
         self.add(foot, heel, ball, (0.032 * u, 0.026 * u), wide=wide, stretch=(1.05, 1.75), blend=blend)
         owner, group = foot if toe is None else toe, self.parts[-1].group
-        self.add(
-            owner, ball, tip, (0.026 * u, 0.017 * u), wide=wide, stretch=(1.75, 2.1), group=group, blend=blend
-        )
+        self.add(owner, ball, tip, (0.026 * u, 0.017 * u), wide=wide, stretch=(1.75, 2.1), group=group, blend=blend)
         instep = place(0.8 * ball_at, sole - 0.036)
-        self.add(foot, place(0.005 * u, 0), instep, (0.034 * u, 0.024 * u), blend=blend)
+        self.add(foot, place(0.005 * u, 0.0), instep, (0.034 * u, 0.024 * u), blend=blend)
 
     def others(self) -> None:
         """Bones that no name tells: tails, hair, props. What leads down to the pelvis has no flesh."""

@@ -36,7 +36,7 @@ def grow_mannequin(
     surface is grown and bound in a pose with the limbs spread (`spread_limbs`), so `skin.vertices` need not
     be the surface at rest. It is watertight and, around one tree, in one piece; limbs that cannot be spread
     apart melt into each other. Parts thinner than the triangles are made as thick: the fingers of a skeleton
-    that has them come apart from some 30,000 vertices on, and are a mitten before.
+    that has them are a mitten below some 40,000 vertices, and webbed above where they lie close.
 
     Args:
       num_vertices: at least 500; what comes is within 10 % of it.
@@ -137,15 +137,11 @@ def bone_weights(
     bones_away = hops[np.ix_(body.joints[nearest], joints)]
     shares = np.where(bones_away <= 1, np.exp(-gap / (0.1 * thickness[:, None])), 0.0)
     shares /= shares.sum(axis=1, keepdims=True)
-    shares = np.where(
-        bones_away <= 2, np.maximum(_spread_heat(shares, vertices, faces, 0.5 * thickness), 0.0), 0.0
-    )
+    shares = np.where(bones_away <= 2, np.maximum(_spread_heat(shares, vertices, faces, 0.5 * thickness), 0.0), 0.0)
     return joints, shares / shares.sum(axis=1, keepdims=True)
 
 
-def _spread_heat(
-    values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, width: np.ndarray
-) -> np.ndarray:
+def _spread_heat(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, width: np.ndarray) -> np.ndarray:
     """Solves (1 - w² Δ) u = values on the surface: a step spreads as exp(-x / w) to both sides.
 
     w is `width`, and no less than the mean edge.
@@ -163,9 +159,7 @@ def _spread_heat(
     return scipy.sparse.linalg.splu(system.tocsc()).solve(degree[:, None] * values)
 
 
-def strongest(
-    weights: Float[np.ndarray, "v p"], count: int
-) -> tuple[Int[np.ndarray, "v k"], Float[np.ndarray, "v k"]]:
+def strongest(weights: Float[np.ndarray, "v p"], count: int) -> tuple[Int[np.ndarray, "v k"], Float[np.ndarray, "v k"]]:
     """Columns and values of the largest weights of every row, which sum to 1 again.
 
     The first weight that is left out is taken off those that stay, so that they fade in and out over the
@@ -180,9 +174,7 @@ def strongest(
     return order[:, :count], values / values.sum(axis=1, keepdims=True)
 
 
-def vertex_normals(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "t 3"]
-) -> Float[np.ndarray, "v 3"]:
+def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "t 3"]) -> Float[np.ndarray, "v 3"]:
     """Unit normals, the mean of those of the faces around weighted by area."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     face_normals = np.cross(b - a, c - a)

@@ -5,6 +5,7 @@ glTF; matrices act on column vectors. Lengths are metres, times seconds, angles 
 skeletons are data of the program (NumPy, static under `jit`); poses are pytrees of arrays.
 """
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
@@ -132,9 +133,7 @@ def quaternion_to_rotation_vector(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3
     return jnp.where(small, series, 2.0 * jnp.arctan2(sine, w) / sine) * v
 
 
-def slerp(
-    a: Float[Array, "*#b 4"], b: Float[Array, "*#b 4"], t: Float[Array, "*#b 1"]
-) -> Float[Array, "*b 4"]:
+def slerp(a: Float[Array, "*#b 4"], b: Float[Array, "*#b 4"], t: Float[Array, "*#b 1"]) -> Float[Array, "*b 4"]:
     """Spherical interpolation from the unit quaternion a (t = 0) to b (t = 1), the short way round.
 
     Where a and b are nearly one rotation it is the normalised linear interpolation; the switch lies where
@@ -219,6 +218,14 @@ def sample_keys(
     return jnp.where((times >= key_times[last])[:, None], knots[last:], curve)
 
 
+@functools.partial(jax.jit, static_argnames=("interpolation", "rotation"))
+def _sample_batch(key_times, values, times, *, interpolation: Interpolation, rotation: bool):
+    def sample(key_times, values):
+        return sample_keys(key_times, values, times, interpolation=interpolation, rotation=rotation)
+
+    return jax.vmap(sample, out_axes=1)(key_times, values)
+
+
 def sample_clip(clip: Clip, skeleton: Skeleton, times: Float[Array, " f"]) -> Pose:
     """The pose of every joint at each time (seconds, in the clip's own time), in the dtype of `times`.
 
@@ -226,22 +233,16 @@ def sample_clip(clip: Clip, skeleton: Skeleton, times: Float[Array, " f"]) -> Po
     """
     num_frames, num_joints, dtype = times.shape[0], len(skeleton.parents), times.dtype
     pose = {
-        path: jnp.broadcast_to(
-            jnp.asarray(getattr(skeleton.rest, path), dtype=dtype), (num_frames, num_joints, size)
-        )
+        path: jnp.broadcast_to(jnp.asarray(getattr(skeleton.rest, path), dtype=dtype), (num_frames, num_joints, size))
         for path, size in (("translation", 3), ("rotation", 4), ("scale", 3))
     }
+    # Frames are padded to whole steps of 64 and channels and keys in `_batches`, so that the clips of a character share
+    # a few compiled samplers; eagerly, op by op, a first call took seconds per clip.
+    padded_times = jnp.concatenate([times, jnp.repeat(times[-1:], -num_frames % 64)])
     for joints, path, interpolation, key_times, values in _batches(clip.channels):
-
-        def sample(key_times, values, path=path, interpolation=interpolation):
-            return sample_keys(
-                key_times, values, times, interpolation=interpolation, rotation=path == "rotation"
-            )
-
-        sampled = jax.vmap(sample, out_axes=1)(
-            jnp.asarray(key_times, dtype=dtype), jnp.asarray(values, dtype=dtype)
-        )
-        pose[path] = pose[path].at[:, joints].set(sampled)
+        keys = jnp.asarray(key_times, dtype=dtype), jnp.asarray(values, dtype=dtype)
+        sampled = _sample_batch(*keys, padded_times, interpolation=interpolation, rotation=path == "rotation")
+        pose[path] = pose[path].at[:, joints].set(sampled[:num_frames])
     return Pose(**pose)
 
 
@@ -303,6 +304,8 @@ def _batches(
     for (path, interpolation), group in groupby(sorted(channels, key=kind), key=kind):
         members = list(group)
         num_keys = max(len(channel.times) for channel in members)
+        num_keys = 1 if num_keys == 1 else max(64, 1 << (num_keys - 1).bit_length())
+        members += members[-1:] * (-len(members) % 16)
         padded = [_padded(channel, num_keys) for channel in members]
         joints = np.asarray([channel.joint for channel in members], dtype=np.int32)
         yield joints, path, interpolation, np.stack([t for t, _ in padded]), np.stack([v for _, v in padded])

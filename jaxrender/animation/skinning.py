@@ -87,9 +87,7 @@ def skinning_matrices(skin: Skin, globals: Float[Array, "*b j 4 4"]) -> Float[Ar
     return jax.lax.scan(add_influence, start, (skin.joint_indices.T, skin.weights.T))[0]
 
 
-def transform_normals(
-    linear: Float[Array, "*#b 3 3"], normals: Float[Array, "*#b 3"]
-) -> Float[Array, "*b 3"]:
+def transform_normals(linear: Float[Array, "*#b 3 3"], normals: Float[Array, "*#b 3"]) -> Float[Array, "*b 3"]:
     """Unit normals of a surface mapped by `linear`.
 
     By the cofactor matrix, det(M) M⁻ᵀ: right under any scale and shear without an inverse, and still

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrender.checks import check_last_axis, check_order
-from jaxrender.harmonics.sh import bands, sh_basis
+from jaxrender.harmonics.sh import bands, basis_columns, sh_basis
 from jaxrender.vecmath import constant_like
 
 
@@ -30,7 +30,17 @@ def zh_to_sh(coefficients: Float[Array, "*#b l"], axis: Float[Array, "*#b 3"]) -
 
 def lobes_to_sh(coefficients: Float[Array, "*#b c l"], axes: Float[Array, "*#b c 3"]) -> Float[Array, "*b k"]:
     """Sum of c lobes as SH coefficients (Shadowed Relighting, eq. 1, with c lobes, not c+1)."""
-    return jnp.sum(zh_to_sh(coefficients, axes), axis=-2)
+    check_last_axis("axes", axes, 3)
+    order = coefficients.shape[-1]
+    factors = constant_like(np.sqrt(4 * math.pi / (2 * np.arange(order) + 1)), coefficients)
+    scaled = coefficients * factors
+    columns: list = []
+    # Lobe by lobe and column by column: `zh_to_sh` would hold c vectors for each sum.
+    for lobe in range(axes.shape[-2]):
+        basis = basis_columns(*(axes[..., lobe, i] for i in range(3)), order=order)
+        part = [scaled[..., lobe, l] * y for l, y in zip(bands(order), basis, strict=True)]
+        columns = [a + b for a, b in zip(columns, part, strict=True)] if columns else part
+    return jnp.moveaxis(jnp.stack(columns), 0, -1)
 
 
 def legendre(x: Float[Array, "*b"], *, order: int) -> Float[Array, "*b l"]:

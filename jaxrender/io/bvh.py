@@ -129,8 +129,7 @@ def parse_bvh(
         for joint, track in rotations.items()
     ]
     moving = [
-        Channel(joint, "translation", "LINEAR", times, _float32(scale * track))
-        for joint, track in positions.items()
+        Channel(joint, "translation", "LINEAR", times, _float32(scale * track)) for joint, track in positions.items()
     ]
     rest = Pose(
         translation=jnp.asarray(scale * offsets, dtype=jnp.float32),

@@ -45,9 +45,7 @@ def from_places(places):
 
 
 def snake():
-    return make_skeleton(
-        [-1, *range(20)], [[0, 0, 0], *([0.03 * np.sin(0.7 * i), 0, 0.08] for i in range(20))]
-    )
+    return make_skeleton([-1, *range(20)], [[0, 0, 0], *([0.03 * np.sin(0.7 * i), 0, 0.08] for i in range(20))])
 
 
 def star():
@@ -149,9 +147,7 @@ def check_shape(mesh, normals):
 def bind_globals(skin, num_joints):
     """World from joint in the pose the skin was bound in; the identity for joints that move nothing."""
     matrices = np.tile(np.eye(4), (num_joints, 1, 1))
-    matrices[np.asarray(skin.palette_joints)] = np.linalg.inv(
-        np.asarray(skin.inverse_binds, dtype=np.float64)
-    )
+    matrices[np.asarray(skin.palette_joints)] = np.linalg.inv(np.asarray(skin.inverse_binds, dtype=np.float64))
     return matrices
 
 
@@ -209,9 +205,7 @@ def test_the_rest_of_a_scaled_and_turned_skeleton_is_used():
         plain.parents,
         Pose(
             translation=plain.rest.translation / 2,
-            rotation=plain.rest.rotation.at[0].set(
-                jnp.asarray([0, np.sin(0.5), 0, np.cos(0.5)], dtype=jnp.float32)
-            ),
+            rotation=plain.rest.rotation.at[0].set(jnp.asarray([0, np.sin(0.5), 0, np.cos(0.5)], dtype=jnp.float32)),
             scale=plain.rest.scale.at[0].set(2.0),
         ),
     )
@@ -388,9 +382,7 @@ def test_a_straight_limb_has_no_knob_at_its_joint():
         one_part(radius_b=0.1, b=np.array([0, 0.25, 0])),
         one_part(joint=1, group=1, radius_b=0.1, a=np.array([0, 0.25, 0])),
     ]
-    value, _ = evaluate(
-        assemble(halves, np.array([[0, 1], [1, 0]])), np.array([[0.1, 0.25, 0], [0, 0.25, 0.1]])
-    )
+    value, _ = evaluate(assemble(halves, np.array([[0, 1], [1, 0]])), np.array([[0.1, 0.25, 0], [0, 0.25, 0.1]]))
     np.testing.assert_allclose(value, 0.0, atol=1e-12)
 
 

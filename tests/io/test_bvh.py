@@ -111,9 +111,7 @@ def test_a_position_channel_replaces_its_component_of_the_offset(write):
 
 def test_quaternions_are_unit_and_do_not_jump_in_sign(write, rng):
     angles = np.cumsum(rng.uniform(5, 25, size=(80, 3)), axis=0)
-    _, clip = read_bvh(
-        write(one_joint(["Yrotation", "Zrotation", "Xrotation"], angles)), skip_calibration=False
-    )
+    _, clip = read_bvh(write(one_joint(["Yrotation", "Zrotation", "Xrotation"], angles)), skip_calibration=False)
     q = track(clip, 0, "rotation").values.astype(np.float64)
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, atol=QUATERNION)
     assert np.all(np.sum(q[1:] * q[:-1], axis=1) > 0)
@@ -173,9 +171,7 @@ def test_the_unit_follows_the_rest_pose_or_is_given(write):
 
 def test_a_skeleton_without_extent_keeps_its_unit(write):
     def tall(height):
-        return SAMPLE.replace("OFFSET 0 -4 0", f"OFFSET 0 {height} 0").replace(
-            "OFFSET 0 -3 0", "OFFSET 0 0 0"
-        )
+        return SAMPLE.replace("OFFSET 0 -4 0", f"OFFSET 0 {height} 0").replace("OFFSET 0 -3 0", "OFFSET 0 0 0")
 
     assert parse_bvh(write(tall(0))).unit_scale == 1.0
     with pytest.raises(InputError, match="positions: expected coordinates below"):

@@ -72,9 +72,7 @@ class Case:
 
     @property
     def id(self) -> str:
-        return (
-            f"{self.kernel.split('.', 1)[-1]}[{self.label}]" if self.label else self.kernel.split(".", 1)[-1]
-        )
+        return f"{self.kernel.split('.', 1)[-1]}[{self.label}]" if self.label else self.kernel.split(".", 1)[-1]
 
 
 _rng = np.random.default_rng(4711)
@@ -208,9 +206,7 @@ def _sh() -> list[Case]:
                     theirs[:, i + m] = (coefficients[:, i + m] - 1j * coefficients[:, i - m]) / math.sqrt(2)
                     theirs[:, i - m] = (-1) ** m * theirs[:, i + m].conj()
         cases += [
-            Case(
-                "harmonics.sh.sh_to_layout", {"sh": coefficients, "layout": layout}, layout, ulps32=LONG_SUM
-            ),
+            Case("harmonics.sh.sh_to_layout", {"sh": coefficients, "layout": layout}, layout, ulps32=LONG_SUM),
             Case("harmonics.sh.sh_from_layout", {"sh": theirs, "layout": layout}, layout, ulps32=LONG_SUM),
         ]
     return cases
@@ -240,9 +236,7 @@ def _zh() -> list[Case]:
         ),
         Case("harmonics.zh.clamped_cosine_zh", {"order": 10}),
         Case("harmonics.zh.hemisphere_zh", {"order": 10}),
-        Case(
-            "harmonics.zh.phong_zh", {"exponent": exponents, "order": 4}, "order 4", gradients=("exponent",)
-        ),
+        Case("harmonics.zh.phong_zh", {"exponent": exponents, "order": 4}, "order 4", gradients=("exponent",)),
         Case("harmonics.zh.phong_zh", {"exponent": exponents[1:], "order": 10}, "order 10", ulps32=LONG_SUM),
     ]
 
@@ -523,9 +517,7 @@ def _skeleton() -> list[Case]:
     b[0], b[1] = a[0], -a[1]  # no turn at all, twice
     b[2] = a[2] + 1e-5 * _normal(4)
     b[2] /= np.linalg.norm(b[2])
-    vectors = np.concatenate(
-        [np.zeros((1, 3)), 1e-9 * _unit(1), 1e-3 * _unit(1), 3.0 * _unit(2), _normal(3, 3)]
-    )
+    vectors = np.concatenate([np.zeros((1, 3)), 1e-9 * _unit(1), 1e-3 * _unit(1), 3.0 * _unit(2), _normal(3, 3)])
     half_angle = np.array([[0.0], [1e-8], [1e-3], [0.7], [1.5]])
     quaternions = np.concatenate([np.sin(half_angle) * _unit(5), np.cos(half_angle)], axis=-1)
     quaternions[3] = -quaternions[3]
@@ -754,8 +746,8 @@ def _skinning() -> list[Case]:
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
-        _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility, _pose_model,
-        _skeleton, _skinning,
+        _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility,
+        _pose_model, _skeleton, _skinning,
     )
     for case in room()
 )  # fmt: skip

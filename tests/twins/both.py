@@ -35,9 +35,7 @@ def run_jax(case: Case, dtype: Any) -> tuple[Any, dict[str, np.ndarray]]:
         def objective(free: dict[str, jax.Array], fixed: dict[str, jax.Array]) -> tuple[jax.Array, Any]:
             result = case.outcome(function(**free, **fixed, **rest))
             outputs = [x for x in _arrays(result) if jnp.issubdtype(x.dtype, jnp.floating)]
-            parts = [
-                jnp.sum(x * jnp.asarray(w, x.dtype)) for x, w in zip(outputs, _mix(outputs), strict=True)
-            ]
+            parts = [jnp.sum(x * jnp.asarray(w, x.dtype)) for x, w in zip(outputs, _mix(outputs), strict=True)]
             return sum(parts), result
 
         free = {name: arrays.pop(name) for name in _differentiated(case, dtype)}
@@ -56,9 +54,7 @@ def run_torch(case: Case, dtype: Any) -> tuple[Any, dict[str, np.ndarray]]:
         free = [arrays[name].requires_grad_() for name in names]
         result = case.outcome(public("torchref", case.kernel)(**arrays, **rest))
         outputs = [x for x in _arrays(result) if x.is_floating_point()]
-        parts = [
-            (x * torch.tensor(w, dtype=x.dtype)).sum() for x, w in zip(outputs, _mix(outputs), strict=True)
-        ]
+        parts = [(x * torch.tensor(w, dtype=x.dtype)).sum() for x, w in zip(outputs, _mix(outputs), strict=True)]
         slopes = torch.autograd.grad(sum(parts), free) if free else []
         pairs = zip(names, slopes, strict=True)
         return result, {name: _tangential(case, name, g.numpy()) for name, g in pairs}

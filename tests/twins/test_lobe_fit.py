@@ -39,9 +39,7 @@ def test_free_fit_is_as_good_as_brute_force(rng):
     best = twin.fit_zh_lobes(
         torch.tensor(v), num_lobes=NUM_LOBES, order=ORDER, num_starts=12, num_steps=60
     ).residual.numpy()
-    fit = compiled(
-        lambda x: zh_fit.fit_zh_lobes(x, num_lobes=NUM_LOBES, order=ORDER), jnp.asarray(v, jnp.float32)
-    )
+    fit = compiled(lambda x: zh_fit.fit_zh_lobes(x, num_lobes=NUM_LOBES, order=ORDER), jnp.asarray(v, jnp.float32))
     ours, size = np.asarray(fit.residual), (v**2).sum(-1)
     # The twin is at a minimum to 1e-6 of the vector's size; below that would be an error of one of the two.
     assert (ours > best - 1e-6 * size).all()
@@ -77,12 +75,8 @@ def test_anchored_fit_ends_at_the_same_axes(rng):
 @pytest.mark.slow
 def test_shared_axes_are_as_good_as_brute_force(rng):
     v = visibilities(rng, 10).reshape(2, 5, ORDER**2)
-    brute = twin.fit_shared_axes(
-        torch.tensor(v), num_lobes=NUM_LOBES, order=ORDER, num_starts=12, num_steps=60
-    )
-    ours = compiled(
-        lambda x: zh_fit.fit_shared_axes(x, num_lobes=NUM_LOBES, order=ORDER), jnp.asarray(v, jnp.float32)
-    )
+    brute = twin.fit_shared_axes(torch.tensor(v), num_lobes=NUM_LOBES, order=ORDER, num_starts=12, num_steps=60)
+    ours = compiled(lambda x: zh_fit.fit_shared_axes(x, num_lobes=NUM_LOBES, order=ORDER), jnp.asarray(v, jnp.float32))
     errors = [
         twin.solve_lobe_coefficients(torch.tensor(v), a[:, None], order=ORDER)[1].sum(-1).numpy()
         for a in (torch.tensor(np.asarray(ours, dtype=np.float64)), brute)

@@ -30,8 +30,7 @@ def test_both_packages_read_the_same_model(tmp_path, dtype):
     assert our_header == their_header == header
     assert (ours.features.kind, ours.features.size) == (theirs.features.kind, theirs.features.size)
     arrays_of = [
-        {name: x for name, x in leaves(m) if name not in (".features.kind", ".features.size")}
-        for m in (ours, theirs)
+        {name: x for name, x in leaves(m) if name not in (".features.kind", ".features.size")} for m in (ours, theirs)
     ]
     assert {k: x.dtype for k, x in arrays_of[0].items()} == {k: x.dtype for k, x in arrays_of[1].items()}
     assert_close(*arrays_of, ulps=0)

@@ -117,8 +117,7 @@ def test_signature(name):
         return
     signatures = [inspect.signature(x) for x in (ours, theirs)]
     parameters = [
-        [(p.name, p.kind.name, p.default, spelled(p.annotation)) for p in s.parameters.values()]
-        for s in signatures
+        [(p.name, p.kind.name, p.default, spelled(p.annotation)) for p in s.parameters.values()] for s in signatures
     ]
     assert parameters[0] == parameters[1]
     assert spelled(signatures[0].return_annotation) == spelled(signatures[1].return_annotation)

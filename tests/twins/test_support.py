@@ -25,9 +25,7 @@ def test_equal_results_pass():
 
 
 def test_a_difference_is_named_with_leaf_and_worst_index():
-    with pytest.raises(
-        AssertionError, match=r"kernel \.second\[0\]: worst at \(1, 2\): got 5\.25.* expected 5,"
-    ):
+    with pytest.raises(AssertionError, match=r"kernel \.second\[0\]: worst at \(1, 2\): got 5\.25.* expected 5,"):
         assert_close(pair(0.25), pair(), ulps=64, what="kernel")
 
 

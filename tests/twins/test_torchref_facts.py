@@ -161,9 +161,7 @@ def test_layout_of_scipy(rng):
     c, s = tensor(rng.normal(size=36)), unit(rng, 7)
     theirs = sh.sh_to_layout(c, "scipy").numpy()
     theta, phi = np.arccos(s[:, 2]), np.arctan2(s[:, 1], s[:, 0])
-    value = sum(
-        theirs[l * (l + 1) + m] * sph_harm_y(l, m, theta, phi) for l in range(6) for m in range(-l, l + 1)
-    )
+    value = sum(theirs[l * (l + 1) + m] * sph_harm_y(l, m, theta, phi) for l in range(6) for m in range(-l, l + 1))
     assert_close(value, sh.sh_evaluate(c, tensor(s)).numpy().astype(complex), ulps=TIGHT)
 
 
@@ -484,9 +482,7 @@ def test_relight_is_the_integral_over_the_lobe(rng, alpha):
         x = np.cross(r, [0.3, 0.5, -0.8])
         x /= np.linalg.norm(x)
         world = local @ np.stack([x, np.cross(r, x), r])
-        vis = sh.sh_evaluate(
-            zh.lobes_to_sh(s["coefficients"][v], s["axes"][v]), tensor(world @ s["frames"][v].numpy())
-        )
+        vis = sh.sh_evaluate(zh.lobes_to_sh(s["coefficients"][v], s["axes"][v]), tensor(world @ s["frames"][v].numpy()))
         radiance = oracles.real_harmonics(world, 4) @ s["light"].numpy().T
         lobe = (alpha + 1) / (2 * np.pi) * local[:, 2] ** alpha
         expected = s["albedo"][v].numpy() * ((weights * lobe * vis.numpy()) @ radiance)

@@ -78,9 +78,7 @@ def quaternion_conjugate(q: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
 def quaternion_to_matrix(q: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
     """The matrix whose columns are q e q* for the unit vectors e of the axes."""
     axes = torch.cat([torch.eye(3), torch.zeros(3, 1)], dim=-1).to(q)
-    turned = quaternion_multiply(
-        quaternion_multiply(q[..., None, :], axes), quaternion_conjugate(q)[..., None, :]
-    )
+    turned = quaternion_multiply(quaternion_multiply(q[..., None, :], axes), quaternion_conjugate(q)[..., None, :])
     return turned[..., :3].transpose(-1, -2)
 
 
@@ -114,9 +112,7 @@ def quaternion_to_rotation_vector(q: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b
 
 
 @in_float64
-def slerp(
-    a: Float[Tensor, "*#b 4"], b: Float[Tensor, "*#b 4"], t: Float[Tensor, "*#b 1"]
-) -> Float[Tensor, "*b 4"]:
+def slerp(a: Float[Tensor, "*#b 4"], b: Float[Tensor, "*#b 4"], t: Float[Tensor, "*#b 1"]) -> Float[Tensor, "*b 4"]:
     """a (a* b)^t with the sign of b that makes the way short: the rotation vector of a* b, times t.
 
     References:
@@ -164,9 +160,7 @@ def sample_keys(
     return torch.stack([_sample_key(key_times, values, time, interpolation, rotation) for time in times])
 
 
-def _sample_key(
-    key_times: Tensor, values: Tensor, time: Tensor, interpolation: str, rotation: bool
-) -> Tensor:
+def _sample_key(key_times: Tensor, values: Tensor, time: Tensor, interpolation: str, rotation: bool) -> Tensor:
     points = values[:, 1] if interpolation == "CUBICSPLINE" else values
     if time <= key_times[0]:
         return points[0]
@@ -203,12 +197,9 @@ def sample_clip(clip: Clip, skeleton: Skeleton, times: Float[Tensor, " f"]) -> P
 @in_float64
 def local_matrices(pose: Pose) -> Float[Tensor, "*b j 4 4"]:
     """M = T R S of every joint as the product of three 4 x 4 matrices."""
-    lead = torch.broadcast_shapes(
-        pose.translation.shape[:-1], pose.rotation.shape[:-1], pose.scale.shape[:-1]
-    )
+    lead = torch.broadcast_shapes(pose.translation.shape[:-1], pose.rotation.shape[:-1], pose.scale.shape[:-1])
     translate, rotate, scale = (
-        torch.eye(4, dtype=pose.rotation.dtype, device=pose.rotation.device).repeat(*lead, 1, 1)
-        for _ in range(3)
+        torch.eye(4, dtype=pose.rotation.dtype, device=pose.rotation.device).repeat(*lead, 1, 1) for _ in range(3)
     )
     translate[..., :3, 3] = pose.translation
     rotate[..., :3, :3] = quaternion_to_matrix(pose.rotation)

@@ -65,9 +65,7 @@ def skinning_matrices(skin: Skin, globals: Float[Tensor, "*b j 4 4"]) -> Float[T
 
 
 @in_float64
-def transform_normals(
-    linear: Float[Tensor, "*#b 3 3"], normals: Float[Tensor, "*#b 3"]
-) -> Float[Tensor, "*b 3"]:
+def transform_normals(linear: Float[Tensor, "*#b 3 3"], normals: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 3"]:
     """Unit normals of a surface mapped by a matrix: along M⁻ᵀ n, from the images of two tangents.
 
     Images of tangents t × b = n span the new tangent plane, so M t × M b = det(M) M⁻ᵀ n; the sign of det(M)

@@ -57,9 +57,7 @@ def apply_operator(operator: Float[Tensor, "*#b k k"], sh: Float[Tensor, "*#b k"
     return torch.einsum("...ij,...j->...i", operator, sh)
 
 
-def _operator(
-    u: Float[Tensor, "*b q"], weights: Float[Tensor, "*b q"], order: int
-) -> Float[Tensor, "*b k k"]:
+def _operator(u: Float[Tensor, "*b q"], weights: Float[Tensor, "*b q"], order: int) -> Float[Tensor, "*b k k"]:
     """2π Σ_q w_q N_l^m(1-u_q) N_l'^m(1-u_q) on each block of equal m."""
     # At azimuth 0 only cosines are left: y_l0 = N_l^0, y_lm = √2 N_l^m. sin θ comes from u = 1 - cos θ
     # unrounded.

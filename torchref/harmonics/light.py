@@ -24,9 +24,7 @@ def environment_directions(height: int, width: int) -> tuple[Tensor, Tensor]:
     theta = math.pi * (rows + 0.5) / height
     phi = 2.0 * math.pi * ((columns + 0.5) / width - 0.5)
     sin, cos = torch.sin(theta)[:, None], torch.cos(theta)[:, None]
-    directions = torch.stack(
-        [sin * torch.sin(phi), cos * torch.ones_like(phi), -sin * torch.cos(phi)], dim=-1
-    )
+    directions = torch.stack([sin * torch.sin(phi), cos * torch.ones_like(phi), -sin * torch.cos(phi)], dim=-1)
     edges = torch.cos(math.pi * torch.arange(height + 1, dtype=torch.float64) / height)
     solid_angle = (edges[:-1] - edges[1:]) * 2.0 * math.pi / width
     return directions, solid_angle[:, None].expand(height, width)

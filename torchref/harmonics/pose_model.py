@@ -1,6 +1,6 @@
 """The run-time model of a character: pose features to zonal lobes of visibility, step 1 of the run time.
 
-One point, one group, one joint at a time. Checking model files is the partner's; `load_pose_model` trusts them.
+One point, one group, one joint at a time. Checking a model file is the partner's; `load_pose_model` trusts it.
 """
 
 import json
@@ -113,14 +113,10 @@ def _euler_angles(q: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3"]:
 
 
 @in_float64
-def raw_features(
-    basis: FeatureBasis, pose: Pose, globals: Float[Tensor, "*b j 4 4"]
-) -> Float[Tensor, "*b g n"]:
+def raw_features(basis: FeatureBasis, pose: Pose, globals: Float[Tensor, "*b j 4 4"]) -> Float[Tensor, "*b g n"]:
     """The features of a pose before projection, for every kind but "given"."""
     if basis.kind == "surroundings":
-        return surroundings(
-            globals, bones=basis.bones, joints=basis.joints, falloff=basis.falloff, size=basis.size
-        )
+        return surroundings(globals, bones=basis.bones, joints=basis.joints, falloff=basis.falloff, size=basis.size)
     angles = joint_angles(
         pose,
         joints=basis.joints,
@@ -141,10 +137,7 @@ def project_features(basis: FeatureBasis, raw: Float[Tensor, "*b g n"]) -> Float
 @in_float64
 def predict_numbers(model: PoseModel, components: Float[Tensor, "g k"]) -> Float[Tensor, "p d"]:
     """The 6c numbers of each point: bias + components of its group · weights."""
-    rows = [
-        w[0] + components[group] @ w[1:]
-        for w, group in zip(model.weights, model.groups.tolist(), strict=True)
-    ]
+    rows = [w[0] + components[group] @ w[1:] for w, group in zip(model.weights, model.groups.tolist(), strict=True)]
     return torch.stack(rows)
 
 
@@ -179,9 +172,7 @@ def load_pose_model(path: str | pathlib.Path) -> tuple[PoseModel, dict]:
     with safetensors.safe_open(path, framework="pt") as file:
         header = json.loads(file.metadata()["header"])
         arrays = {name: file.get_tensor(name) for name in file.keys()}
-    features = {
-        name.removeprefix("features."): x for name, x in arrays.items() if name.startswith("features.")
-    }
+    features = {name.removeprefix("features."): x for name, x in arrays.items() if name.startswith("features.")}
     basis = FeatureBasis(kind=header["feature_kind"], size=header["feature_size"], **features)
     rest = {name: x for name, x in arrays.items() if not name.startswith("features.")}
     return PoseModel(features=basis, **rest), header

@@ -26,9 +26,7 @@ def rotate_lobes(axes: Float[Tensor, "*v c 3"], rotation: Float[Tensor, "*v 3 3"
 
 
 @in_float64
-def phong_transfer(
-    visibility: Float[Tensor, "*v k"], exponent: Float[Tensor, "*#v"]
-) -> Float[Tensor, "*v k"]:
+def phong_transfer(visibility: Float[Tensor, "*v k"], exponent: Float[Tensor, "*#v"]) -> Float[Tensor, "*v k"]:
     """Step 4: t = (α+1)/2π M^α v, where z is the axis of the Phong lobe (eq. 2)."""
     order = round(visibility.shape[-1] ** 0.5)
     operator = phong_normalization(exponent)[..., None, None] * phong_operator(exponent, order=order)

@@ -111,9 +111,7 @@ def triple_product_tensor(order_a: int, order_b: int, order_out: int) -> np.ndar
 def _gaunt_block(la: int, lb: int, lc: int) -> np.ndarray:
     """∫ Y_la^m Y_lb^n Y_lc^o for all m, n, o."""
     block = np.zeros((2 * la + 1, 2 * lb + 1, 2 * lc + 1))
-    scale = math.sqrt((2 * la + 1) * (2 * lb + 1) * (2 * lc + 1) / (4 * math.pi)) * _wigner_3j(
-        la, lb, lc, 0, 0
-    )
+    scale = math.sqrt((2 * la + 1) * (2 * lb + 1) * (2 * lc + 1) / (4 * math.pi)) * _wigner_3j(la, lb, lc, 0, 0)
     for m in range(-la, la + 1):
         for n in range(max(-lb, -lc - m), min(lb, lc - m) + 1):
             block[la + m, lb + n, lc - m - n] = scale * _wigner_3j(la, lb, lc, m, n)

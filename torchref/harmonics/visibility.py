@@ -73,9 +73,7 @@ def _pack(visible: Tensor) -> UInt8[Tensor, " bytes"]:
     return sum(padded[:, i] << (7 - i) for i in range(8))
 
 
-def _any_hit(
-    origin: Float[Tensor, "3"], rays: Float[Tensor, "d 3"], triangles: Float[Tensor, "t 3 3"]
-) -> Tensor:
+def _any_hit(origin: Float[Tensor, "3"], rays: Float[Tensor, "d 3"], triangles: Float[Tensor, "t 3 3"]) -> Tensor:
     """Which rays meet a triangle ahead: origin + s·ray = a + u e1 + v e2, solved by Cramer's rule."""
     a, e1, e2 = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     away = (origin - a).expand(len(rays), -1, -1)

@@ -31,9 +31,7 @@ def zh_to_sh(coefficients: Float[Tensor, "*#b l"], axis: Float[Tensor, "*#b 3"])
 
 
 @in_float64
-def lobes_to_sh(
-    coefficients: Float[Tensor, "*#b c l"], axes: Float[Tensor, "*#b c 3"]
-) -> Float[Tensor, "*b k"]:
+def lobes_to_sh(coefficients: Float[Tensor, "*#b c l"], axes: Float[Tensor, "*#b c 3"]) -> Float[Tensor, "*b k"]:
     """The sum of c lobes; eq. 1 of the same paper, with x running over c lobes and not c + 1 as printed."""
     return zh_to_sh(coefficients, axes).sum(-2)
 

@@ -31,9 +31,7 @@ class ZHLobes:
 
 
 @in_float64
-def axis_from_chart(
-    chart: Float[Tensor, "*#b 2"], reference: Float[Tensor, "*#b 3 3"]
-) -> Float[Tensor, "*b 3"]:
+def axis_from_chart(chart: Float[Tensor, "*#b 2"], reference: Float[Tensor, "*#b 3 3"]) -> Float[Tensor, "*b 3"]:
     """Unit axis from stereographic coordinates about the z column of a frame.
 
     The chart plane touches the sphere at the z axis and is seen from the opposite pole: a point q = chart/2
@@ -46,9 +44,7 @@ def axis_from_chart(
 
 
 @in_float64
-def chart_from_axis(
-    axis: Float[Tensor, "*#b 3"], reference: Float[Tensor, "*#b 3 3"]
-) -> Float[Tensor, "*b 2"]:
+def chart_from_axis(axis: Float[Tensor, "*#b 3"], reference: Float[Tensor, "*#b 3 3"]) -> Float[Tensor, "*b 2"]:
     """The inverse of `axis_from_chart`: 2 (x, y) / (1 + z) in the frame; the opposite pole is at infinity."""
     local = torch.einsum("...ji,...j->...i", reference, axis)
     return 2.0 * local[..., :2] / (1.0 + local[..., 2:])
@@ -132,8 +128,7 @@ def _designs(axes: Float[Tensor, "*b c 3"], order: int) -> list[Tensor]:
     """For each band the matrix (2l+1, c) from lobe coefficients to SH coefficients."""
     y = sh_basis(axes, order=order)
     return [
-        math.sqrt(4.0 * math.pi / (2 * l + 1)) * y[..., l * l : (l + 1) ** 2].transpose(-1, -2)
-        for l in range(order)
+        math.sqrt(4.0 * math.pi / (2 * l + 1)) * y[..., l * l : (l + 1) ** 2].transpose(-1, -2) for l in range(order)
     ]
 
 
