@@ -39,7 +39,7 @@ import numpy as np
 from benchmarks.suites import Measurement, Options
 from benchmarks.timing import Timing, measure, measure_alternating, peak_memory
 from fitting.config import BakeSettings, FitSettings, SplitSettings, TrainSettings
-from fitting.dataset import VisibilityStore, bake, character_frames, choose_points
+from fitting.dataset import PosedMesh, VisibilityStore, bake, character_frames, choose_points
 from fitting.features import all_raw_features, feature_groups, fit_basis, unfitted_basis
 from fitting.model import to_half
 from fitting.motion import SEGMENT, TRAIN, sample_motion
@@ -57,6 +57,8 @@ from jaxrender.vecmath import normalize, reflection_frame
 
 ORDER = 4
 NUM_LOBES = 2
+#: What `Measurement.params` may hold.
+Params = dict[str, str | int | float | bool]
 POOL_SWITCH = "--xla_cpu_multi_thread_eigen="
 #: Steps 1 to 5 that are under way at once in the row that measures throughput rather than latency.
 IN_FLIGHT = 16
@@ -146,7 +148,7 @@ def _bake(sizes: Sizes, seed: int) -> Iterator[Measurement]:
                 "embree": lambda: [_cast(EmbreeScene(r[0], faces), *r[1:]) for r in rays],
                 "embree, casting only": lambda: [_cast(scene, *r[1:]) for scene, r in zip(scenes, rays, strict=True)],
                 "stage: skinning": lambda: [frame(i) for i in frames],
-                "stage: store": lambda: [scratch.write(i, bits[i]) for i in frames],
+                "stage: store": lambda: list(map(scratch.write, frames, bits)),
             },
             min_runs=sizes.bake_runs,
             max_runs=sizes.bake_runs,
@@ -186,7 +188,7 @@ def _cast(scene: EmbreeScene, origins: np.ndarray, directions: np.ndarray) -> np
 def _bake_memory(sizes: Sizes, seed: int) -> Iterator[Measurement]:
     for num_frames in sizes.memory_frames:
         peak, num_points = _in_fresh_process(_bake_peak, sizes, num_frames, seed)
-        params = {"num_points": num_points, "num_frames": num_frames, "num_directions": sizes.directions}
+        params: Params = {"num_points": num_points, "num_frames": num_frames, "num_directions": sizes.directions}
         metrics = {"peak_bytes": peak, "rays": num_frames * num_points * sizes.directions}
         yield Measurement("bake_memory", "jaxrender", metrics, params)
 
@@ -232,7 +234,7 @@ def _lobe_fit(sizes: Sizes, seed: int) -> Iterator[Measurement]:
     for name, timing in timings.items():
         lost = float(jnp.sum(fits[name]().residual) / jnp.sum(sh * sh))
         metrics = {**timing.metrics(), "us_per_vertex_frame": 1e3 * timing.ms_median / num}
-        params = {"num_lobes": int(name), "num_vertices": sh.shape[0], "num_frames": sh.shape[1]}
+        params: Params = {"num_lobes": int(name), "num_vertices": sh.shape[0], "num_frames": sh.shape[1]}
         yield Measurement("lobe_fit", "jaxrender", metrics | {"relative_l2": lost**0.5}, params | _xla_params())
 
 
@@ -260,7 +262,7 @@ def _linear_solve(sizes: Sizes, seed: int) -> Iterator[Measurement]:
             "rank": float(fit.rank),
             "residual": float(fit.residual),
         }
-        params = {"num_frames": frames, "num_features": columns, "num_columns": targets.shape[1]}
+        params: Params = {"num_frames": frames, "num_features": columns, "num_columns": targets.shape[1]}
         yield Measurement("linear_solve", "jaxrender", metrics, params | _xla_params())
 
 
@@ -310,7 +312,7 @@ def _train(sizes: Sizes, refine_steps: int, num_mixed: int, seed: int) -> tuple[
         "model_bytes_float32": sum(array.nbytes for array in model_arrays(result.model).values()),
         "model_bytes_float16": sum(array.nbytes for array in model_arrays(half).values()),
     }
-    params = {
+    params: Params = {
         "num_points": len(result.data.points.vertices),
         "num_frames": len(held_out) + len(trained),
         "num_mixed": num_mixed,
@@ -431,9 +433,11 @@ def _runtime_rows(sizes: Sizes, seed: int) -> list[Measurement]:
     step_4, step_5 = jax.jit(harmonics.phong_transfer), jax.jit(harmonics.shade_transfer)
     transfer = step_4(visibility, uniform.exponent)
 
-    scalar, each = {"exponent": "scalar"}, {"exponent": "per point"}
-    without, with_offset = {"offset": False}, {"offset": True}
-    rows: list[tuple[str, dict, Callable[[], Any]]] = [
+    scalar: Params = {"exponent": "scalar"}
+    each: Params = {"exponent": "per point"}
+    without: Params = {"offset": False}
+    with_offset: Params = {"offset": True}
+    rows: list[tuple[str, Params, Callable[[], Any]]] = [
         ("pose features", {}, lambda: features(model.features, pose)),
         ("skinning", {}, lambda: skinned(body.skin, pose)),
         ("step 1: synthesize", {}, functools.partial(jax.jit(harmonics.predict_lobes), model, components)),
@@ -446,7 +450,7 @@ def _runtime_rows(sizes: Sizes, seed: int) -> list[Measurement]:
     ]
     for offset, steps in whole.items():
         for kind, lit in ((scalar, uniform), (each, scene)):
-            params = {"offset": offset, **kind}
+            params: Params = {"offset": offset, **kind}
             rows.append(("steps 1-5", params, functools.partial(steps, components, lit)))
             if _xla_threads() == "one" and num_cores() > 1:
                 parts = _divide(lit, p, num_cores())
@@ -468,7 +472,7 @@ def _runtime_rows(sizes: Sizes, seed: int) -> list[Measurement]:
         for lit in (uniform, scene)
     }
     timings = _alternate({str(i): row[2] for i, row in enumerate(rows)}, sizes)
-    common = {"num_points": p, "num_lobes": NUM_LOBES, "num_components": components.shape[-1]}
+    common: Params = {"num_points": p, "num_lobes": NUM_LOBES, "num_components": components.shape[-1]}
     found = []
     for i, (variant, params, function) in enumerate(rows):
         calls = IN_FLIGHT if "in flight" in variant else 1
@@ -534,7 +538,7 @@ def _sh(sizes: Sizes, seed: int) -> Iterator[Measurement]:
         for (kernel, variant), (_, error) in rows.items():
             timing = timings[f"{kernel} {variant}"]
             metrics = {**timing.metrics(), "ns_per_item": 1e6 * timing.ms_median / num, "relative_l2": error}
-            params = {"kernel": kernel, "order": order, "num_items": num}
+            params: Params = {"kernel": kernel, "order": order, "num_items": num}
             yield Measurement("sh", variant, metrics, params | _xla_params())
 
 
@@ -546,7 +550,7 @@ def _sh_rows(order: int, num: int, rng: np.random.Generator) -> dict[tuple[str, 
     sh = jnp.asarray(rng.standard_normal((num, order**2), np.float32))
     exponents = jnp.asarray(rng.uniform(0.0, 100.0, num), jnp.float32)
     operator = jax.jit(functools.partial(harmonics.phong_operator, order=order))
-    kernels = {
+    kernels: dict[str, tuple[Callable, Callable]] = {
         "jaxrender": (
             jax.jit(functools.partial(harmonics.sh_basis, order=order)),
             jax.jit(harmonics.sh_rotate),
@@ -554,7 +558,7 @@ def _sh_rows(order: int, num: int, rng: np.random.Generator) -> dict[tuple[str, 
     }
     if _installed("e3nn_jax", "sh", "e3nn"):
         kernels["e3nn"] = _e3nn(order)
-    rows = {}
+    rows: dict[tuple[str, str], tuple[Callable[[], Any], float]] = {}
     for variant, (basis, rotate) in kernels.items():
         # Laws that hold in every layout: Σ y² = order² / 4π, and y(Rd) = R y(d).
         y = basis(directions)
@@ -647,7 +651,7 @@ def _twin(sizes: Sizes, seed: int) -> Iterator[Measurement]:
     difference = _relative_l2(variants["jaxrender"](), variants["torchref"]().numpy())
     for variant, timing in timings.items():
         metrics = {**timing.metrics(), "hz": 1e3 / timing.ms_median, "relative_l2": difference}
-        params = {"num_points": p, "num_lobes": NUM_LOBES, "offset": False, "exponent": "scalar"}
+        params: Params = {"num_points": p, "num_lobes": NUM_LOBES, "offset": False, "exponent": "scalar"}
         yield Measurement("twin", variant, metrics, params | _xla_params())
 
 
@@ -659,7 +663,7 @@ def _body(num_vertices: int) -> Character:
     return builtin_character(num_vertices=num_vertices)
 
 
-def _spread_frames(body: Character, settings: BakeSettings, count: int) -> Callable[[int], Any]:
+def _spread_frames(body: Character, settings: BakeSettings, count: int) -> Callable[[int], PosedMesh]:
     """Frame number below `count` -> posed mesh, evenly over all of the body's motion."""
     motion = sample_motion(body, settings, SplitSettings())
     chosen = np.linspace(0, len(motion) - 1, count).astype(int)
@@ -692,7 +696,7 @@ def _xla_threads() -> str:
     return "one" if f"{POOL_SWITCH}false" in os.environ.get("XLA_FLAGS", "") else "pool"
 
 
-def _xla_params() -> dict[str, str]:
+def _xla_params() -> Params:
     return {"xla_threads": _xla_threads()}
 
 

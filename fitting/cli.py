@@ -196,12 +196,12 @@ def joint_angle_features(character: Character, motion):
 def run_demo(options) -> None:
     """`jaxrender demo`: the built-in character, small enough for two cores and five minutes."""
     settings = TrainSettings(
-        BakeSettings(max_frames=150, num_mixed=120, max_points=2000, seed=options.seed),
+        BakeSettings(max_frames=150, num_mixed=100, seed=options.seed),
         SplitSettings(),
         FitSettings(num_components=32, refine_steps=18),
     )
     train_and_report(
-        open_character(None, 5000), settings, options.out, source=None, num_vertices=5000, study=False,
+        open_character(None, 3000), settings, options.out, source=None, num_vertices=3000, study=False,
         as_json=options.json,
     )  # fmt: skip
 

@@ -37,10 +37,11 @@ def builtin_environment(height: int = 128) -> Float[np.ndarray, "h w 3"]:
     """A procedural sky: blue above, warm at the horizon, grey ground, and a sun of 6 degrees, high on the right."""
     directions, _ = environment_directions(height, 2 * height)
     up = directions[..., 1:2]
-    sky = np.array([0.16, 0.32, 0.75]) * np.maximum(up, 0) + np.array([0.75, 0.68, 0.6]) * np.exp(-6 * np.maximum(up, 0))
-    ground = np.array([0.16, 0.14, 0.12]) * np.ones_like(up)
+    height_above = np.maximum(up, 0)
+    sky = np.array([0.1, 0.2, 0.45]) * height_above + np.array([0.4, 0.36, 0.32]) * np.exp(-6 * height_above)
+    ground = np.array([0.07, 0.06, 0.05]) * np.ones_like(up)
     image = np.where(up > 0, sky, ground)
-    sun = np.array([0.62, 0.62, 0.48]) / np.linalg.norm([0.62, 0.62, 0.48])
+    sun = np.array([0.75, 0.6, 0.28]) / np.linalg.norm([0.75, 0.6, 0.28])
     image = image + np.array([150.0, 125.0, 95.0]) * (directions @ sun > math.cos(math.radians(6.0)))[..., None]
     return image.astype(np.float32)
 

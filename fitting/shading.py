@@ -20,22 +20,15 @@ from jaxrender.harmonics.visibility import hemisphere_directions, trace_visibili
 MATERIALS = ("phong", "diffuse", "membrane")
 
 
-def first_vertices(model: PoseModel) -> np.ndarray:
-    """A mesh vertex for each shading point."""
-    _, first = np.unique(np.asarray(model.points), return_index=True)
-    return first
-
-
 def make_shader(character: Character, model: PoseModel, *, material: str = "phong") -> Callable:
     """The whole run-time path: pose -> skinned mesh and lobes -> vertex colors.
 
     Returns:
       a jitted function (pose, *, eye, light, exponent, albedo, transmission) -> positions (v, 3), colors (v, 3). `pose`
-      is one pose; `eye` (3,) in world space; `light` (3, 16); `exponent` a scalar or one per shading point; `albedo`
+      is one pose; `eye` (3,) in world space; `light` (3, 16); `exponent` a scalar or one per vertex; `albedo`
       (v, 3); `transmission` (3,), for the membrane. Differentiable in all of them. Points that see nothing are black.
     """
     check_one_of("material", material, MATERIALS)
-    points = first_vertices(model)
 
     @jax.jit
     def shade(pose: Pose, *, eye, light, exponent=1.0, albedo=None, transmission=(0.0, 0.0, 0.0)):
@@ -43,16 +36,19 @@ def make_shader(character: Character, model: PoseModel, *, material: str = "phon
         mesh = skin_mesh(character.skin, globals)
         lobes = predict_lobes(model, project_features(model.features, raw_features(model.features, pose, globals)))
         eye, light, transmission = (jnp.asarray(x, jnp.float32) for x in (eye, light, transmission))
-        at, frames = mesh.positions[points], mesh.frames[points]
+        # Every vertex has the lobes of its point, but a frame and place of its own: shading stays smooth where one
+        # point stands for several vertices.
+        axes, coefficients = (numbers[model.points] for numbers in lobes)
+        offset, at, frames = model.offset[model.points], mesh.positions, mesh.frames
         white = jnp.ones_like(at)
         if material == "phong":
             exponents = jnp.asarray(exponent, jnp.float32)
-            colors = relight(*lobes, frames, at, light, exponents, white, eye, offset=model.offset)
+            colors = relight(axes, coefficients, frames, at, light, exponents, white, eye, offset=offset)
         elif material == "diffuse":
-            colors = relight_diffuse(*lobes, frames, light, white, offset=model.offset)
+            colors = relight_diffuse(axes, coefficients, frames, light, white, offset=offset)
         else:
-            colors = membrane(*lobes, frames, light, white, transmission, offset=model.offset)
-        colors = jnp.where(model.visible[:, None], colors, jnp.zeros_like(colors))[model.points]
+            colors = membrane(axes, coefficients, frames, light, white, transmission, offset=offset)
+        colors = jnp.where(model.visible[model.points][:, None], colors, jnp.zeros_like(colors))
         return mesh.positions, colors * jnp.asarray(character.albedo if albedo is None else albedo, jnp.float32)
 
     return shade
@@ -86,8 +82,8 @@ def traced_colors(
     Neither visibility nor reflection is cut to four bands here; the light is the model's, so what differs is the
     model's error. With `shadows` off the visibility is the whole hemisphere of the normal.
     """
-    points = first_vertices(model)
     local = hemisphere_directions(num_directions)
+    points = np.arange(len(mesh.positions))
     if shadows:
         bits = trace_visibility(mesh.positions, mesh.frames, np.asarray(character.faces), local, points=points)
     else:
@@ -101,8 +97,8 @@ def traced_colors(
             bits[own], at, frames, jnp.asarray(light), jnp.asarray(eye, jnp.float32), jnp.float32(exponent), tau,
             jnp.asarray(local, jnp.float32), material,
         )  # fmt: skip
-    colors[~np.asarray(model.visible)] = 0.0
-    return colors[np.asarray(model.points)] * np.asarray(character.albedo)
+    colors[~np.asarray(model.visible)[np.asarray(model.points)]] = 0.0
+    return colors * np.asarray(character.albedo)
 
 
 @functools.partial(jax.jit, static_argnames="material")

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
 from jaxrender.checks import check_at_least
+from jaxrender.vecmath import matmul, safe_div, safe_sqrt
 
 
 @jax.tree_util.register_dataclass
@@ -29,10 +31,11 @@ def fit_linear(
 ) -> LinearFit:
     """Least squares with a penalty λ|X|², λ = ridge · trace(AᵀA) / j on centred columns; the bias is free.
 
-    One QR factorisation serves all n right-hand sides: of [A; √λ I] where there are more frames than features, of
-    [Aᵀ; √λ I] (the dual form X = Aᵀ(AAᵀ + λI)⁻¹B) where there are fewer. The normal equations are never formed,
-    which keeps float32 as good as float64 at the condition numbers of joint angles (1e4). At ridge = 0 singular
-    directions are cut at the usual relative tolerance.
+    One QR factorisation serves all n right-hand sides: of [A; √λ I] where there are more frames than features,
+    of [Aᵀ; √λ I] (the dual form X = Aᵀ(AAᵀ + λI)⁻¹B) where there are fewer. The normal equations are never
+    formed, which keeps float32 as good as float64 at the condition numbers of joint angles (1e4). Directions
+    whose singular value is zero up to rounding (eps · max(f, j) · the largest) get no weight, so that at
+    ridge = 0 the solution is the shortest one.
 
     Args:
       features: pose features, one row per frame.
@@ -47,22 +50,37 @@ def fit_linear(
     mean_a, mean_b = jnp.mean(features, axis=0), jnp.mean(targets, axis=0)
     a, b = features - mean_a[None, :], targets - mean_b[None, :]
     frames, columns = a.shape
-    lam = jnp.asarray(ridge, dtype=a.dtype) * jnp.sum(a * a) / columns
-    # The singular values tell the rank; below the tolerance a direction is noise and gets no weight.
-    singular = jnp.linalg.svd(a, compute_uv=False)
-    cutoff = jnp.max(singular) * max(a.shape) * jnp.finfo(a.dtype).eps
-    floor = jnp.maximum(jnp.sqrt(lam), jnp.maximum(cutoff, jnp.finfo(a.dtype).tiny))
     tall = a if frames >= columns else a.T
-    q, r = jnp.linalg.qr(jnp.concatenate([tall, floor * jnp.eye(tall.shape[1], dtype=a.dtype)]))
+    root = safe_sqrt(jnp.asarray(ridge, dtype=a.dtype) * jnp.sum(a * a) / columns)
+    largest, empty, rank = _empty_directions(jax.lax.stop_gradient(tall), root)
+
+    # Directions without content would divide by rounding noise: they are filled, and projected out afterwards.
+    penalty = root * jnp.eye(len(empty), dtype=a.dtype) + largest * empty
+    q, r = jnp.linalg.qr(jnp.concatenate([tall, penalty]))
     if frames >= columns:
-        weights = jax.scipy.linalg.solve_triangular(r, q[:frames].T @ b)
+        weights = solve_triangular(r, matmul(q[:frames].T, b))
+        weights = weights - matmul(empty, weights)
     else:
-        inner = jax.scipy.linalg.solve_triangular(r, b, trans=1)
-        weights = a.T @ jax.scipy.linalg.solve_triangular(r, inner)
-    error = jnp.sqrt(jnp.sum((a @ weights - b) ** 2) / jnp.maximum(jnp.sum(b * b), jnp.finfo(b.dtype).tiny))
-    return LinearFit(weights, mean_b - mean_a @ weights, jnp.sum(singular > cutoff), error)
+        inner = solve_triangular(r, solve_triangular(r, b - matmul(empty, b), trans=1))
+        weights = matmul(a.T, inner - matmul(empty, inner))
+    error = safe_sqrt(safe_div(jnp.sum((matmul(a, weights) - b) ** 2), jnp.sum(b * b)))
+    return LinearFit(weights, mean_b - matmul(mean_a, weights), rank, error)
+
+
+def _empty_directions(tall: Float[Array, "n m"], root: Float[Array, ""]) -> tuple[Array, Array, Array]:
+    """Largest singular value (1 if all are 0), projector on the directions without content, and the rank.
+
+    A direction that the ridge, by its root, holds down already is left alone, which keeps it differentiable.
+    """
+    _, singular, directions = jnp.linalg.svd(tall, full_matrices=False)
+    cutoff = singular[0] * (max(tall.shape) * float(jnp.finfo(tall.dtype).eps))
+    full = singular > cutoff
+    chosen = jnp.where((full | (root > cutoff))[:, None], jnp.zeros_like(directions), directions)
+    largest = jnp.where(singular[0] > 0, singular[0], jnp.ones_like(cutoff))
+    return largest, matmul(chosen.T, chosen), jnp.sum(full)
 
 
 def predict_linear(fit: LinearFit, features: Float[Array, "*b j"]) -> Float[Array, "*b n"]:
     """features @ weights + bias."""
-    return features @ fit.weights + jnp.broadcast_to(fit.bias, (*features.shape[:-1], fit.bias.shape[0]))
+    predicted = matmul(features, fit.weights)
+    return predicted + jnp.broadcast_to(fit.bias, predicted.shape)

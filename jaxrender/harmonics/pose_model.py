@@ -1,9 +1,9 @@
-"""The run-time model of a character: pose features to zonal lobes of visibility, step 1 of the run-time steps.
+"""The run-time model of a character: pose features to zonal lobes of visibility, run-time step 1.
 
 A model has one linear map per shading point, from k pose components (and a constant) to 6c numbers: two chart
-coordinates and four zonal coefficients for each of c lobes. Points are grouped, usually by the bone they hang on
-most, and every group may see the pose through features of its own. A constant SH vector per point takes what the
-lobes leave on average over the training poses.
+coordinates and four zonal coefficients for each of c lobes. Points are grouped, usually by the bone they hang
+on most, and every group may see the pose through features of its own. A constant SH vector per point takes
+what the lobes leave on average over the training poses.
 """
 
 import hashlib
@@ -15,21 +15,22 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from safetensors import SafetensorError, safe_open
 
-from jaxrender.animation.skeleton import Pose, quaternion_conjugate, quaternion_multiply, quaternion_to_rotation_vector
-from jaxrender.checks import bad_input
+from jaxrender.animation.skeleton import (
+    Pose,
+    quaternion_conjugate,
+    quaternion_multiply,
+    quaternion_to_rotation_vector,
+)
+from jaxrender.checks import bad_input, check_finite
 from jaxrender.harmonics.zh_fit import axis_from_chart, reference_frames
-from jaxrender.vecmath import safe_sqrt
+from jaxrender.vecmath import einsum, safe_div, safe_sqrt
 
 FORMAT, FORMAT_VERSION = "jaxrender-pose-visibility", 1
 FeatureKind = Literal["surroundings", "exponential_map", "euler", "given"]
 FEATURE_KINDS = ("surroundings", "exponential_map", "euler", "given")
-
-
-def _static(**kwargs):
-    return field(metadata={"static": True}, **kwargs)
 
 
 @jax.tree_util.register_dataclass
@@ -37,13 +38,13 @@ def _static(**kwargs):
 class FeatureBasis:
     """How a pose becomes k components per group: raw features, minus their mean, on principal axes.
 
-    `surroundings` has G groups with a bone each and looks from that bone at the `joints`; the other kinds have one
-    group. `falloff[g, i]` scales the orientation part of joint i for group g, `size` is the body's extent, and
-    `reference` holds the local rotations from which exponential maps and Euler angles are measured.
+    `surroundings` has g groups with a bone each and looks from that bone at the `joints`; the other kinds have
+    one group. `falloff[g, i]` scales the orientation part of joint i for group g, `size` is the body's extent,
+    and `reference` holds the local rotations from which exponential maps and Euler angles are measured.
     """
 
-    kind: FeatureKind = _static()
-    size: float = _static()
+    kind: FeatureKind = field(metadata={"static": True})
+    size: float = field(metadata={"static": True})
     joints: Int[Array, " i"]
     bones: Int[Array, " g"]
     falloff: Float[Array, "g i"]
@@ -73,10 +74,11 @@ class PoseModel:
     offset: Float[Array, "p 16"]
     groups: Int[Array, " p"]
     points: Int[Array, " v"]
-    visible: Array
+    visible: Bool[Array, " p"]
 
     @property
     def num_lobes(self) -> int:
+        """c, the number of lobes of each point."""
         return self.axes.shape[-2]
 
 
@@ -88,26 +90,26 @@ def surroundings(
     falloff: Float[Array, "g i"],
     size: float,
 ) -> Float[Array, "*b g n"]:
-    """The body as each bone sees it: where the other joints are and how they are turned, in the bone's own frame.
+    """The body as each bone sees it: where the joints are and how they are turned, in the bone's own frame.
 
-    For joint i at p with |p| = r in the frame of bone g, and length a = size / 9: the direction weighted like a solid
-    angle, a p / (r² + a²); the nearness a / (2r + a); and the joint's axes relative to the bone, falling off with
-    the distance along the skeleton. Joint angles would have to be multiplied out to get there: visibility is much
-    closer to linear in these numbers (docs/performance.md, section on generalisation).
+    For joint i at p with |p| = r in the frame of bone g, and length a = size / 9: the direction weighted like a
+    solid angle, a p / (r² + a²); the nearness a / (2r + a); and a quarter of the joint's axes relative to the
+    bone, times `falloff`. Joint angles would have to be multiplied out to get there: visibility is much closer
+    to linear in these numbers (docs/performance.md, section on generalisation). They do not change when the
+    whole body moves.
 
     Args:
-      globals: world from joint.
+      globals: world from joint; only the directions of their axes count, not the scales.
+      size: extent of the body, in the units of `globals`.
     Returns:
       n = 13 numbers per joint: 3 + 1 + 9.
     """
     a = size / 9.0
-    at, turned = globals[..., joints, :3, 3], globals[..., joints, :3, :3]
-    turned = turned / safe_sqrt(jnp.sum(turned * turned, axis=-2, keepdims=True))
-    home, frame = globals[..., bones, :3, 3], globals[..., bones, :3, :3]
-    frame = frame / safe_sqrt(jnp.sum(frame * frame, axis=-2, keepdims=True))
-    p = jnp.einsum("...gji,...gkj->...gki", frame, at[..., None, :, :] - home[..., :, None, :])
+    at, turned = globals[..., joints, :3, 3], _unit_columns(globals[..., joints, :3, :3])
+    home, frame = globals[..., bones, :3, 3], _unit_columns(globals[..., bones, :3, :3])
+    p = einsum("...gji,...gkj->...gki", frame, at[..., None, :, :] - home[..., :, None, :])
     r2 = jnp.sum(p * p, axis=-1, keepdims=True)
-    axes = jnp.einsum("...gji,...kjl->...gkil", frame, turned)
+    axes = einsum("...gji,...kjl->...gkil", frame, turned)
     fall = falloff.reshape((1,) * (axes.ndim - 4) + (*falloff.shape, 1, 1))
     axes = 0.25 * fall * axes
     parts = [a * p / (r2 + a * a), a / (2.0 * safe_sqrt(r2) + a), axes.reshape(*axes.shape[:-2], 9)]
@@ -115,8 +117,19 @@ def surroundings(
     return together.reshape(*together.shape[:-2], -1)
 
 
+def _unit_columns(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+    lengths = safe_sqrt(jnp.sum(matrix * matrix, axis=-2, keepdims=True))
+    return safe_div(matrix, jnp.broadcast_to(lengths, matrix.shape))
+
+
 def joint_angles(
-    pose: Pose, *, joints: Int[Array, " i"], reference: Float[Array, "i 4"], translations, size: float, euler: bool
+    pose: Pose,
+    *,
+    joints: Int[Array, " i"],
+    reference: Float[Array, "i 4"],
+    translations: Float[Array, "i 3"],
+    size: float,
+    euler: bool,
 ) -> Float[Array, "*b n"]:
     """Joint by joint: rotation from the reference as an exponential map (or Euler angles), shift and log scale.
 
@@ -147,9 +160,7 @@ def _euler_angles(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
 def raw_features(basis: FeatureBasis, pose: Pose, globals: Float[Array, "*b j 4 4"]) -> Float[Array, "*b g n"]:
     """The features of a pose before projection, for every kind but `given`."""
     if basis.kind == "surroundings":
-        return surroundings(
-            globals, bones=basis.bones, joints=basis.joints, falloff=basis.falloff, size=basis.size
-        )
+        return surroundings(globals, bones=basis.bones, joints=basis.joints, falloff=basis.falloff, size=basis.size)
     angles = joint_angles(
         pose,
         joints=basis.joints,
@@ -164,7 +175,7 @@ def raw_features(basis: FeatureBasis, pose: Pose, globals: Float[Array, "*b j 4 
 def project_features(basis: FeatureBasis, raw: Float[Array, "*b g n"]) -> Float[Array, "*b g k"]:
     """Components of raw features on the principal axes of the training poses."""
     centred = raw - jnp.broadcast_to(basis.mean, raw.shape)
-    return jnp.einsum("...gn,gnk->...gk", centred, basis.basis)
+    return einsum("...gn,gnk->...gk", centred, basis.basis)
 
 
 def predict_numbers(model: PoseModel, components: Float[Array, "g k"]) -> Float[Array, "p d"]:
@@ -199,57 +210,100 @@ def predict_lobes(
 _ARRAYS = ("weights", "axes", "offset", "groups", "points", "visible")
 _FEATURE_ARRAYS = ("joints", "bones", "falloff", "reference", "translations", "mean", "basis")
 
+# Number of axes of each array in a file, for those that are not floating point their kind, and numbers a joint.
+_RANKS = {
+    "weights": 3, "axes": 3, "offset": 2, "groups": 1, "points": 1, "visible": 1, "features.joints": 1,
+    "features.bones": 1, "features.falloff": 2, "features.reference": 2, "features.translations": 2,
+    "features.mean": 2, "features.basis": 3,
+}  # fmt: skip
+_INDICES = ("groups", "points", "features.joints", "features.bones")
+_PER_JOINT = {"surroundings": 13, "exponential_map": 9, "euler": 9}
+
 
 def model_arrays(model: PoseModel) -> dict[str, np.ndarray]:
     """The arrays of a model by the names they have in its file."""
     arrays = {name: np.asarray(getattr(model, name)) for name in _ARRAYS}
-    return arrays | {f"features.{name}": np.asarray(getattr(model.features, name)) for name in _FEATURE_ARRAYS}
+    features = {f"features.{name}": np.asarray(getattr(model.features, name)) for name in _FEATURE_ARRAYS}
+    return arrays | features
 
 
 def read_model_file(path: Path) -> tuple[dict[str, np.ndarray], dict]:
-    """Arrays and JSON header of a model file, checked for format, version, shapes and finiteness."""
+    """Arrays and JSON header of a model file, checked for format, version, types, shapes and values.
+
+    Raises:
+      InputError: if anything is not as it should be.
+    """
     try:
         with safe_open(path, framework="np") as file:
             header = json.loads((file.metadata() or {}).get("header", "null"))
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, json.JSONDecodeError, UnicodeDecodeError) as error:
+            names = sorted(set(file.keys()) & _RANKS.keys())
+            arrays = {name: file.get_tensor(name) for name in names}
+    except OSError as error:
+        bad_input(path, "file", expected="a readable file", got=error.strerror or str(error))
+    except (SafetensorError, ValueError, RecursionError) as error:
         bad_input(path, "file", expected="a safetensors file with a JSON header", got=str(error))
+    except (TypeError, AttributeError) as error:  # number types that NumPy does not have
+        bad_input(path, "tensors", expected="types that NumPy knows", got=str(error))
     if not isinstance(header, dict) or header.get("format") != FORMAT:
-        bad_input(path, "format", expected=FORMAT, got=header.get("format") if isinstance(header, dict) else header)
+        got = header.get("format") if isinstance(header, dict) else "no header"
+        bad_input(path, "format", expected=FORMAT, got=got)
     if header.get("version") != FORMAT_VERSION:
         bad_input(path, "version", expected=FORMAT_VERSION, got=header.get("version"))
-    _check_model_arrays(path, arrays, header)
+    if header.get("feature_kind") not in FEATURE_KINDS:
+        expected = f"one of {', '.join(FEATURE_KINDS)}"
+        bad_input(path, "feature_kind", expected=expected, got=header.get("feature_kind"))
+    size = header.get("feature_size")
+    if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < 1e30:
+        bad_input(path, "feature_size", expected="a positive number", got=size)
+    _check_types(path, arrays)
+    _check_shapes(path, arrays, header["feature_kind"])
+    _check_values(path, arrays)
     return arrays, header
 
 
-def _check_model_arrays(path: Path, arrays: dict[str, np.ndarray], header: dict) -> None:
-    wanted = {*_ARRAYS, *(f"features.{name}" for name in _FEATURE_ARRAYS)}
-    if wanted - arrays.keys():
-        bad_input(path, "tensors", expected="all of the model's", got=f"none named {sorted(wanted - arrays.keys())[0]}")
-    if header.get("feature_kind") not in FEATURE_KINDS:
-        bad_input(path, "feature_kind", expected=f"one of {FEATURE_KINDS}", got=header.get("feature_kind"))
-    size = header.get("feature_size")
-    if not isinstance(size, int | float) or not 0 < size < float("inf"):
-        bad_input(path, "feature_size", expected="a positive number", got=size)
-    p, m = arrays["weights"].shape[:2] if arrays["weights"].ndim == 3 else (0, 0)
-    c = arrays["axes"].shape[1] if arrays["axes"].ndim == 3 else 0
-    g, n = arrays["features.mean"].shape if arrays["features.mean"].ndim == 2 else (0, 0)
-    i, v = arrays["features.joints"].size, arrays["points"].size
+def _check_types(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    for name, rank in _RANKS.items():
+        if name not in arrays:
+            bad_input(path, name, expected="a tensor of this name", got="none")
+        array, allowed = arrays[name], ("float32", "float16")
+        if name in _INDICES:
+            allowed = ("int32", "int64")
+        if name == "visible":
+            allowed = ("bool",)
+        if array.dtype.name not in allowed:
+            bad_input(path, name, expected=" or ".join(allowed), got=array.dtype.name)
+        if array.ndim != rank:
+            bad_input(path, name, expected=f"{rank} axes", got=f"shape {array.shape}")
+
+
+def _check_shapes(path: Path, arrays: dict[str, np.ndarray], kind: str) -> None:
+    (p, m, _), c = arrays["weights"].shape, arrays["axes"].shape[1]
+    (g, n), i = arrays["features.mean"].shape, len(arrays["features.joints"])
+    if m < 1 or c < 1:
+        bad_input(path, "weights", expected="a bias row and at least one lobe", got=f"{m} rows, {c} lobes")
+    if kind != "surroundings" and g != 1:
+        bad_input(path, "features.mean", expected=f"one group for {kind}", got=f"{g} groups")
+    n = _PER_JOINT[kind] * i if kind in _PER_JOINT else n
     shapes = {
-        "weights": (p, m, 6 * c), "axes": (p, c, 3), "offset": (p, 16), "groups": (p,), "points": (v,),
-        "visible": (p,), "features.joints": (i,), "features.bones": (arrays["features.bones"].size,),
-        "features.reference": (i, 4), "features.translations": (i, 3), "features.mean": (g, n),
-        "features.basis": (g, n, m - 1), "features.falloff": (arrays["features.bones"].size, i),
+        "weights": (p, m, 6 * c), "axes": (p, c, 3), "offset": (p, 16), "groups": (p,), "visible": (p,),
+        "features.bones": (g,), "features.falloff": (g, i), "features.reference": (i, 4),
+        "features.translations": (i, 3), "features.mean": (g, n), "features.basis": (g, n, m - 1),
     }  # fmt: skip
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             bad_input(path, name, expected=f"shape {shape}", got=f"shape {arrays[name].shape}")
-        if arrays[name].dtype.kind == "f" and not np.isfinite(arrays[name]).all():
-            bad_input(path, name, expected="finite numbers", got="NaN or Inf")
-    for name, limit in (("groups", g), ("points", p)):
-        index = arrays[name]
-        if index.size and (index.min() < 0 or index.max() >= limit):
-            bad_input(path, name, expected=f"indices below {limit}", got=f"{index.min()}..{index.max()}")
+
+
+def _check_values(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    limits = {"groups": len(arrays["features.mean"]), "points": len(arrays["weights"])}
+    for name, array in arrays.items():
+        if name in _INDICES:
+            limit = limits.get(name, 2**31)
+            if array.size and (array.min() < 0 or array.max() >= limit):
+                got = f"{array.min()}..{array.max()}"
+                bad_input(path, name, expected=f"indices from 0 to {limit - 1}", got=got)
+        elif array.dtype != bool:
+            check_finite(path, name, array)
 
 
 def load_pose_model(path: str | Path) -> tuple[PoseModel, dict]:

@@ -25,6 +25,7 @@ TINY = suite.Sizes(
     refine_steps=3,
     num_components=4,
     sh_vectors=30,
+    sh_orders=(4,),
     twin_points=20,
     min_runs=1,
     min_seconds=0.0,
@@ -147,9 +148,9 @@ def test_sh_kernels_and_peer(rows, monkeypatch, capsys):
     found = rows("sh")
     check_numbers(found, "sh")
     for row in found:
-        assert row.metrics["relative_l2"] < 1e-5, row  # float32, at most 100 terms
-    ours = {(row.params["kernel"], row.params["order"]) for row in found if row.variant == "jaxrender"}
-    assert ours == {(name, order) for name in ("sh_basis", "sh_rotate", "phong_operator") for order in (4, 10)}
+        assert row.metrics["relative_l2"] < 1e-5, row  # float32, 16 terms
+    ours = {row.params["kernel"] for row in found if row.variant == "jaxrender"}
+    assert ours == {"sh_basis", "sh_rotate", "phong_operator"}
     monkeypatch.setattr(suite.importlib.util, "find_spec", lambda name: None)
     assert {row.variant for row in rows("sh")} == {"jaxrender"}
     assert "e3nn_jax is not installed" in capsys.readouterr().err

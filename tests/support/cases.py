@@ -447,6 +447,14 @@ def _shading() -> list[Case]:
         ),
         Case("harmonics.relight.relight_diffuse", {**lobes, **surface}, gradients=shared, on=manifolds),
         *(
+            Case(f"harmonics.relight.{name}", {**lobes, **surface, **more, "offset": _normal(v, 16)}, "offset")
+            for name, more in (
+                ("relight", {**view, "exponent": np.array(7.0)}),
+                ("relight_diffuse", {}),
+                ("membrane", {"transmission": _uniform(0, 1, 3)}),
+            )
+        ),
+        *(
             Case(
                 "harmonics.relight.membrane",
                 {**lobes, **surface, "transmission": _uniform(0, 1, *shape)},

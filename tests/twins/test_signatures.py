@@ -29,7 +29,6 @@ EXCEPTIONS = {
     "harmonics.sh.sphere_quadrature": "torchref keeps its rules in a private file",
     "harmonics.zh_fit.greedy_axes": "where jaxrender starts its search; the twin starts from a grid",
     "harmonics.zh_fit.spread_start_axes": "the same",
-    "harmonics.zh_fit.SmallCholesky": "how jaxrender solves small systems in a batch",
     "harmonics.pose_model.model_arrays": "jaxrender writes and checks files; the twin only loads",
     "harmonics.pose_model.read_model_file": "the same",
     "harmonics.pose_model.model_hash": "the same",
@@ -56,13 +55,16 @@ def modules() -> list[str]:
 
 
 def public_names(package: str, module: str) -> dict[str, Any]:
-    """Functions and records that a module defines, by their full name without the package."""
+    """Functions and records that a module defines, by their full name without the package.
+
+    A class that is no record is machinery (a solver, say), and has no partner.
+    """
     loaded = importlib.import_module(f"{package}.{module}")
     return {
         f"{module}.{name}": value
         for name, value in vars(loaded).items()
         if not name.startswith("_")
-        and (inspect.isfunction(value) or inspect.isclass(value))
+        and (inspect.isfunction(value) or dataclasses.is_dataclass(value))
         and value.__module__ == loaded.__name__
         and f"{module}.{name}" not in EXCEPTIONS
     }

@@ -55,12 +55,19 @@ def relight(
     exponent: Float[Tensor, "*#v"],
     albedo: Float[Tensor, "*v c"],
     eye: Float[Tensor, "3"],
+    *,
+    offset: Float[Tensor, "*v k"] | None = None,
 ) -> Float[Tensor, "*v c"]:
-    """Shadowed Phong reflection towards the eye, all in the frame around the mirrored view direction."""
+    """Shadowed Phong reflection towards the eye, all in the frame around the mirrored view direction.
+
+    `offset` is visibility in the vertex frame that comes on top of the lobes.
+    """
     mirror = reflection_frame(normalize(eye - positions), frames[..., 2])
-    local_axes = rotate_lobes(rotate_lobes(axes, frames), mirror.transpose(-1, -2))
-    transfer = phong_transfer(lobes_to_sh(coefficients, local_axes), exponent)
-    return shade_transfer(transfer, mirror, light, albedo)
+    local_from_vertex = mirror.transpose(-1, -2) @ frames
+    visibility = lobes_to_sh(coefficients, rotate_lobes(axes, local_from_vertex))
+    if offset is not None:
+        visibility = visibility + sh_rotate(offset, local_from_vertex)
+    return shade_transfer(phong_transfer(visibility, exponent), mirror, light, albedo)
 
 
 @in_float64
@@ -70,10 +77,13 @@ def relight_diffuse(
     frames: Float[Tensor, "*v 3 3"],
     light: Float[Tensor, "c k"],
     albedo: Float[Tensor, "*v c"],
+    *,
+    offset: Float[Tensor, "*v k"] | None = None,
 ) -> Float[Tensor, "*v c"]:
     """Shadowed diffuse reflection: exponent 1 about the normal, where the lobes already are."""
     lambert = torch.ones((), dtype=axes.dtype, device=axes.device)
-    return shade_transfer(phong_transfer(lobes_to_sh(coefficients, axes), lambert), frames, light, albedo)
+    visibility = lobes_to_sh(coefficients, axes) + (0.0 if offset is None else offset)
+    return shade_transfer(phong_transfer(visibility, lambert), frames, light, albedo)
 
 
 @in_float64
@@ -84,10 +94,13 @@ def membrane(
     light: Float[Tensor, "c k"],
     albedo: Float[Tensor, "*v c"],
     transmission: Float[Tensor, "*#v c"],
+    *,
+    offset: Float[Tensor, "*v k"] | None = None,
 ) -> Float[Tensor, "*v c"]:
     """A thin sheet: shadowed diffuse light from the front, and unshadowed light that passes from behind."""
     order = coefficients.shape[-1]
-    transfer = membrane_transfer(lobes_to_sh(coefficients, axes), transmission, order=order)
+    visibility = lobes_to_sh(coefficients, axes) + (0.0 if offset is None else offset)
+    transfer = membrane_transfer(visibility, transmission, order=order)
     channels = [
         shade_transfer(transfer[..., c, :], frames, light[c : c + 1], albedo[..., c : c + 1])
         for c in range(light.shape[0])
