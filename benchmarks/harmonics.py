@@ -606,7 +606,10 @@ def _e3nn(order: int) -> tuple[Callable, Callable]:
 def _operator_error(operator, order: int) -> float:
     """Against quadrature, at exponents where that is exact."""
     exponents = (0, 1, 5, 20)
-    exact = [harmonics.brdf_operator(lambda x, a=a: x**a, order=order, num_nodes=2 * order + 20) for a in exponents]
+    exact = [
+        harmonics.brdf_operator(functools.partial(jax.lax.integer_pow, y=a), order=order, num_nodes=2 * order + 20)
+        for a in exponents
+    ]
     return _relative_l2(operator(jnp.asarray(exponents, jnp.float32)), np.stack(exact))
 
 

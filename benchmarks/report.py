@@ -19,9 +19,7 @@ Record = dict[str, Any]
 _FIELDS = {"suite": str, "case": str, "variant": str, "params": dict, "metrics": dict, "environment": dict}
 
 
-def make_record(
-    suite: str, measurement: benchmarks.suites.Measurement, environment: Mapping[str, Any]
-) -> Record:
+def make_record(suite: str, measurement: benchmarks.suites.Measurement, environment: Mapping[str, Any]) -> Record:
     """The record of one measurement; a metric that is infinite or NaN (psnr_db of equal images) is null."""
     return console.to_jsonable(
         {
@@ -85,13 +83,9 @@ def format_markdown(records: Sequence[Record]) -> str:
         columns, rows = tabulate(members)
         texts = [columns, *([format_cell(value) for value in row] for row in rows)]
         widths = [max(len(line[i]) for line in texts) for i in range(len(columns))]
-        lines = [
-            "| " + " | ".join(t.ljust(w) for t, w in zip(line, widths, strict=True)) + " |" for line in texts
-        ]
+        lines = ["| " + " | ".join(t.ljust(w) for t, w in zip(line, widths, strict=True)) + " |" for line in texts]
         lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
-        parts.append(
-            f"## {suite}\n\n{describe_environment(members[0]['environment'])}\n\n" + "\n".join(lines)
-        )
+        parts.append(f"## {suite}\n\n{describe_environment(members[0]['environment'])}\n\n" + "\n".join(lines))
     return "\n\n".join(parts)
 
 

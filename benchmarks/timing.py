@@ -85,9 +85,7 @@ def _seconds(function: Callable[[], object]) -> float:
 def _summarize(first: float, seconds: list[float]) -> Timing:
     median = statistics.median(seconds)
     q1, q3 = (
-        (seconds[0], seconds[0])
-        if len(seconds) == 1
-        else statistics.quantiles(seconds, n=4, method="inclusive")[::2]
+        (seconds[0], seconds[0]) if len(seconds) == 1 else statistics.quantiles(seconds, n=4, method="inclusive")[::2]
     )
     return Timing(
         compile_ms=1e3 * max(0.0, first - median),

@@ -159,6 +159,7 @@ def train_and_report(
 
     with console.keeping(f"the frames baked so far are in {out}; the same command continues"):
         result = train_character(character, settings, out, track=track)
+        assert result.motion is not None  # a character always has one
         if settings.fit.num_lobes and as_json is False:
             console.announce(
                 f"ridge {result.ridge:g}; {result.bake.rays_per_second / 1e6:.1f} M rays/s; "
@@ -178,7 +179,7 @@ def train_and_report(
         write_bytes(numbers_path, json.dumps(console.to_jsonable(evaluation.as_dict())).encode())
         console.announce("drawing ...")
         with result.timings.stage("pictures"):
-            pictures = draw_pictures(character, result, evaluation, out)
+            pictures = draw_pictures(character, result.motion, result.model, evaluation, out)
         report = write_report(out, result, settings, evaluation, model_path, pictures)
     record = {"errors": header["errors"], "ridge": result.ridge, "seconds": result.timings.seconds}
     paths = [model_path, numbers_path, *(path for path, _ in pictures), report]

@@ -120,12 +120,12 @@ class VisibilityStore:
             group.create_array("done", shape=(num_frames,), chunks=(1,), dtype="uint8", fill_value=0)
             # The header comes last: a store without it is taken for unfinished and made anew.
             group.attrs.update(header)
-        group = zarr.open_group(path, mode="r+")
-        self._visibility, self._done = group["visibility"], group["done"]
+        self._visibility = zarr.open_array(path / "visibility", mode="r+")
+        self._done = zarr.open_array(path / "done", mode="r+")
 
     def missing(self) -> Int[np.ndarray, " n"]:
         """Frames not baked yet."""
-        return np.flatnonzero(self._done[:] == 0)
+        return np.flatnonzero(np.asarray(self._done[:]) == 0)
 
     def write(self, frame: int, bits: UInt8[np.ndarray, "p bytes"]) -> None:
         self._visibility[frame] = bits
@@ -133,7 +133,7 @@ class VisibilityStore:
 
     def read(self) -> UInt8[np.ndarray, "f p bytes"]:
         """All frames; a bit per ray, so 10,000 points x 300 frames x 256 directions are 96 MB."""
-        return self._visibility[:]
+        return np.asarray(self._visibility[:])
 
 
 def _read_header(path: Path) -> dict | None:

@@ -675,13 +675,12 @@ def _from_angles(numbers):
 
 def point_axes(ground: Ground, num_lobes: int) -> Float[np.ndarray, "n c 3"]:
     """One set of axes per point for all its training frames: the best of several matching pursuits."""
-    seen = ground.sh[ground.train]
-    starts = np.asarray(_start_axes(seen, num_lobes=num_lobes, count=6))
+    starts = np.asarray(_start_axes(ground.sh[ground.train], num_lobes=num_lobes, count=6))
     errors = []
     for axes in starts:
-        fitted = np.asarray(_from_charts(_fixed_axis_numbers(seen, axes), axes))
-        errors.append(np.sum((fitted - seen) ** 2, axis=(0, 2)))
-    return starts[np.argmin(errors, axis=0), np.arange(seen.shape[1])]
+        fitted = np.asarray(_from_charts(_fixed_axis_numbers(ground.sh, axes), axes))
+        errors.append(np.sum((fitted - ground.sh)[ground.train] ** 2, axis=(0, 2)))
+    return starts[np.argmin(errors, axis=0), ground.all_points]
 
 
 def free_fits(sh: Float[np.ndarray, "n 16"], num_lobes: int) -> Float[np.ndarray, "n d"]:
@@ -769,21 +768,23 @@ def lobe_rows(ground: Ground, refined: dict[int, SH], axes: dict[int, np.ndarray
         yield method_row(ground, refined_label(c, ground.fit.offset), 6 * c, refined[c])
 
 
-def subset_rows(ground: Ground, refined: dict[tuple[int, bool], SH], track: Track) -> Iterator[MethodRow]:
+def subset_rows(
+    ground: Ground, refined: dict[tuple[int, bool], SH], axes: dict[int, np.ndarray], track: Track
+) -> Iterator[MethodRow]:
     """From the paper's way to the refined model on the same few points and frames.
 
     Args:
       refined: by number of lobes and offset; trained on all frames, given here for the ground's.
+      axes: of each point, by number of lobes.
     """
     yield method_row(ground, "mean visibility", 0, np.broadcast_to(ground.sh[ground.train].mean(0), ground.sh.shape))
     yield method_row(ground, "linear, 16 SH", 16, ground.linear.predict(ground.sh))
     for c in track(iter(LOBE_COUNTS), len(LOBE_COUNTS), "fits per frame"):
-        axes = point_axes(ground, c)
         predicted, fitted = raw_angle_lobes(ground, c)
         yield method_row(ground, f"{c} lobes, fit per frame, no pose model", 6 * c, fitted)
         yield method_row(ground, f"{c} lobes, raw angles", 6 * c, predicted, note="as the paper prints it")
-        yield method_row(ground, f"{c} lobes, anchored charts", 6 * c, anchored_lobes(ground, axes))
-        yield method_row(ground, f"{c} lobes, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes))
+        yield method_row(ground, f"{c} lobes, anchored charts", 6 * c, anchored_lobes(ground, axes[c]))
+        yield method_row(ground, f"{c} lobes, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
         for offset in (False, True):
             note = "trained on all frames"
             yield method_row(ground, refined_label(c, offset), 6 * c, refined[c, offset], note=note)
@@ -929,7 +930,7 @@ def run_study(
         method_row(ground, "the trained model", 6 * model.num_lobes, own),
         method_row(ground, "Gaussian kernel, 16 SH", 16, kernel, note="the nonlinear reference"),
     ]
-    subset = _subset(ground, refined, track)
+    subset = _subset(ground, refined, axes, track)
     return Study(
         points=points,
         rows=rows,
@@ -951,7 +952,7 @@ def _angle_rows(ground: Ground, angles: Angles | None) -> list[MethodRow]:
     return [method_row(ground, "linear, 16 SH, joint angles", 16, predicted, note=f"ridge {ridge:.3g}")]
 
 
-def _subset(ground: Ground, refined: dict[int, SH], track: Track) -> list[MethodRow]:
+def _subset(ground: Ground, refined: dict[int, SH], axes: dict[int, np.ndarray], track: Track) -> list[MethodRow]:
     """`subset_rows` on whole blocks of points, spread over the groups, and every second frame."""
     found = group_blocks(ground.data.groups, STUDY_BLOCK)
     count = max(1, SUBSET_POINTS // STUDY_BLOCK)
@@ -961,7 +962,11 @@ def _subset(ground: Ground, refined: dict[int, SH], track: Track) -> list[Method
     both = {(c, fit.offset): refined[c][:, some] for c in LOBE_COUNTS}
     both |= {(c, not fit.offset): refined_lobes(few, c, offset=not fit.offset, track=track) for c in LOBE_COUNTS}
     thinned = make_ground(thin(ground.data, some, SUBSET_STEP), fit, linear.ridge)
-    return list(subset_rows(thinned, {key: sh[::SUBSET_STEP] for key, sh in both.items()}, track))
+    return list(
+        subset_rows(
+            thinned, {key: sh[::SUBSET_STEP] for key, sh in both.items()}, {c: a[some] for c, a in axes.items()}, track
+        )
+    )
 
 
 def goals(rows: list[MethodRow], subset: list[MethodRow], fit: FitSettings) -> list[Goal]:

@@ -11,7 +11,7 @@ from fitting.motion import Motion, articulating_joints, influencing_joints, skel
 from jaxrender.animation.skeleton import global_matrices
 from jaxrender.animation.skinning import Character
 from jaxrender.checks import bad_input
-from jaxrender.harmonics.pose_model import FeatureBasis, raw_features
+from jaxrender.harmonics.pose_model import FeatureBasis, FeatureKind, raw_features
 
 
 def feature_groups(
@@ -27,7 +27,9 @@ def feature_groups(
     return bones.astype(np.int32), groups.reshape(-1).astype(np.int32)
 
 
-def unfitted_basis(character: Character, motion: Motion, kind: str, bones: Int[np.ndarray, " g"]) -> FeatureBasis:
+def unfitted_basis(
+    character: Character, motion: Motion, kind: FeatureKind, bones: Int[np.ndarray, " g"]
+) -> FeatureBasis:
     """The basis without its principal axes.
 
     Raises:
@@ -102,7 +104,5 @@ def fit_basis(
         rank = int((values > 1e-12 * max(values[0], 1e-30)).sum())
         directions = scaled.T @ vectors[:, :rank] / np.sqrt(values[:rank]) if wide else vectors[:, :rank]
         axes[g, :, :rank], moments[g, :rank] = directions, values[:rank]
-    fitted = dataclasses.replace(
-        basis, mean=jnp.asarray(mean, jnp.float32), basis=jnp.asarray(axes, jnp.float32)
-    )
+    fitted = dataclasses.replace(basis, mean=jnp.asarray(mean, jnp.float32), basis=jnp.asarray(axes, jnp.float32))
     return fitted, moments

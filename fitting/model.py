@@ -76,5 +76,5 @@ def check_same_character(character: Character, header: dict, path: Path) -> None
     """Raises InputError unless the model was trained on this character."""
     expected = header.get("source", {}).get("content_hash")
     if expected != character.content_hash:
-        expected, got = f"the character of hash {str(expected)[:12]}", f"{character.name}, {character.content_hash[:12]}"
-        bad_input(path, "character", expected=expected, got=got)
+        got = f"{character.name}, {character.content_hash[:12]}"
+        bad_input(path, "character", expected=f"the character of hash {str(expected)[:12]}", got=got)

@@ -1,4 +1,4 @@
-"""Pictures of a trained character: stills beside traced truth, and clips under changing light, exponent and material."""
+"""Pictures of a trained character: stills beside traced truth, clips under changing light, exponent and material."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -13,13 +13,11 @@ from jaxtyping import Float
 from fitting.evaluate import Evaluation
 from fitting.motion import SEGMENT, Motion
 from fitting.shading import make_shader, posed_mesh, traced_colors
-from fitting.train import TrainResult
 from jaxrender.animation.skeleton import Pose, sample_clip
-from jaxrender.animation.skinning import Character
+from jaxrender.animation.skinning import Character, SkinnedMesh
 from jaxrender.camera import Camera, frame_bounds
 from jaxrender.checks import bad_input
-from jaxrender.harmonics.light import environment_directions, project_environment, rotate_environment
-from jaxrender.harmonics.light import sh_window
+from jaxrender.harmonics.light import environment_directions, project_environment, rotate_environment, sh_window
 from jaxrender.harmonics.pose_model import PoseModel
 from jaxrender.harmonics.sh import sh_rotate
 from jaxrender.io.exr import write_exr
@@ -84,10 +82,9 @@ def exposure_of(colors: Float[np.ndarray, "v 3"]) -> float:
 
 
 def draw_pictures(
-    character: Character, result: TrainResult, evaluation: Evaluation, out: Path, *, size: int = 420
+    character: Character, motion: Motion, model: PoseModel, evaluation: Evaluation, out: Path, *, size: int = 420
 ) -> list[tuple[Path, str]]:
     """The report's pictures, written into `out`; files and captions."""
-    motion, model = result.motion, result.model
     index = _telling_frame(motion, evaluation)
     pose = pose_at(motion.pose, index)
     mesh = posed_mesh(character, pose)
@@ -101,8 +98,8 @@ def draw_pictures(
     held = "held out of training" if motion.part[index] != 0 else "a training frame"
     pictures = [
         (still.comparison(out / "diffuse.png", "diffuse", light, 1.0),
-         f"Diffuse under the built-in sky ({where}, {held}): without shadows, the model, traced truth, and the difference "
-         "(white: a quarter of the bright tone)."),
+         f"Diffuse under the built-in sky ({where}, {held}): without shadows, the model, traced truth, and the "
+         "difference (white: a quarter of the bright tone)."),
         (still.comparison(out / "phong.png", "phong", light, 12.0), "Phong, exponent 12, local viewer."),
         (still.comparison(out / "membrane.png", "membrane", turn_light(light, 2.6), 1.0),
          "Thin membrane, lit from behind: front light is shadowed, back light is not, as in the paper."),
@@ -133,7 +130,7 @@ class Still:
     character: Character
     model: PoseModel
     pose: Pose
-    mesh: object
+    mesh: SkinnedMesh
     camera: Camera
     size: int
 
@@ -167,7 +164,7 @@ class Still:
 
     def _surface(self) -> VisibleSurface:
         faces = np.asarray(self.character.faces)
-        return visible_surface(self.mesh.positions, faces, self.camera, height=self.size, width=self.size)
+        return visible_surface(np.asarray(self.mesh.positions), faces, self.camera, height=self.size, width=self.size)
 
 
 @dataclass(frozen=True)
@@ -221,7 +218,7 @@ def film_frames(
         positions, colors = shade(pose, **options)
         stops = exposure_of(np.asarray(colors)) if stops is None else stops
         surface = visible_surface(np.asarray(positions), faces, camera, height=height, width=width)
-        sky = environment_background(surface, rotate_environment(environment, angle))
+        sky = environment_background(surface, np.asarray(rotate_environment(jnp.asarray(environment), angle)))
         linear = color_surface(surface, faces, np.asarray(colors), sky)
         if each is not None:
             each(index, linear)

@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,8 +51,10 @@ def _subtitle(result: TrainResult, evaluation: Evaluation) -> str:
 def _summary(report: Report, result: TrainResult, evaluation: Evaluation, model_path: Path) -> None:
     report.section("In short")
     weights = np.asarray(result.model.weights)
-    facts = {f"SH error, {SETS[name]}": row and row["global"] for name, row in evaluation.errors.items()}
-    facts |= {f"the same with the mean visibility, {SETS[n]}": r and r["global"] for n, r in evaluation.baseline.items()}
+    facts: dict[str, Any] = {
+        f"SH error, {SETS[name]}": row and row["global"] for name, row in evaluation.errors.items()
+    }
+    facts |= {f"mean visibility alone, {SETS[n]}": r and r["global"] for n, r in evaluation.baseline.items()}
     facts |= {
         "points that see nothing (masked)": f"{evaluation.invisible_share:.1%}",
         "ridge": result.ridge,
@@ -162,7 +165,7 @@ def _flat(rows: list[dict]) -> list[dict]:
     """Rows of nested dicts as flat ones, sets named in words."""
     flat = []
     for row in rows:
-        line = {}
+        line: dict[str, Any] = {}
         for key, value in row.items():
             if isinstance(value, dict):
                 line |= {f"{key}, {SETS.get(k, k)}": v for k, v in value.items() if not isinstance(v, dict | list)}
@@ -177,5 +180,6 @@ def _run(report: Report, result: TrainResult, settings: TrainSettings) -> None:
     report.section("The run")
     seconds = {name: console.format_seconds(value) for name, value in result.timings.seconds.items()}
     report.facts(seconds | {"machine": f"{cpu_model()}, {num_cores()} cores"}, caption="Time per stage.")
-    flat = {f"{group}.{key}": str(value) for group, values in settings.as_dict().items() for key, value in values.items()}
+    groups = settings.as_dict().items()
+    flat = {f"{group}.{key}": str(value) for group, values in groups for key, value in values.items()}
     report.facts(flat, caption="Settings.")

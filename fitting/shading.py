@@ -83,18 +83,18 @@ def traced_colors(
     model's error. With `shadows` off the visibility is the whole hemisphere of the normal.
     """
     local = hemisphere_directions(num_directions)
-    points = np.arange(len(mesh.positions))
+    positions, frames = np.asarray(mesh.positions), np.asarray(mesh.frames)
+    points = np.arange(len(positions))
     if shadows:
-        bits = trace_visibility(mesh.positions, mesh.frames, np.asarray(character.faces), local, points=points)
+        bits = trace_visibility(positions, frames, np.asarray(character.faces), local, points=points)
     else:
         bits = np.full((len(points), num_directions // 8), 255, np.uint8)
     tau = jnp.asarray(transmission, jnp.float32)
     colors = np.zeros((len(points), 3), np.float32)
     for start in range(0, len(points), 512):
         own = slice(start, start + 512)
-        at, frames = mesh.positions[points[own]], mesh.frames[points[own]]
         colors[own] = _integrate(
-            bits[own], at, frames, jnp.asarray(light), jnp.asarray(eye, jnp.float32), jnp.float32(exponent), tau,
+            bits[own], positions[own], frames[own], jnp.asarray(light), jnp.asarray(eye, jnp.float32), jnp.float32(exponent), tau,
             jnp.asarray(local, jnp.float32), material,
         )  # fmt: skip
     colors[~np.asarray(model.visible)[np.asarray(model.points)]] = 0.0
@@ -122,4 +122,3 @@ def _integrate(bits, positions, frames, light, eye, exponent, tau, local, materi
         return front
     behind = sh_basis(-directions, order=4) @ light.T
     return front + tau * jnp.einsum("d,pdc->pc", cosine, behind) * solid
-

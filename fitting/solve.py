@@ -6,6 +6,7 @@ and the ridge solve a division: the factorisation is the one of `fit_basis`.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -145,9 +146,9 @@ def refine_block(
         return state, None
 
     value, gradient = _objective(weights, rows, sh, axes, penalty_metric, on)
-    start = (weights, value, gradient, jnp.zeros_like(weights), jnp.full_like(value, 0.7))
-    (weights, value, *_), _ = jax.lax.scan(step, start, None, length=num_steps)
-    return weights, value
+    start: Any = (weights, value, gradient, jnp.zeros_like(weights), jnp.full_like(value, 0.7))
+    end, _ = jax.lax.scan(step, start, None, length=num_steps)
+    return end[0], end[1]
 
 
 def block_sh(bits: np.ndarray, table: np.ndarray) -> Float[np.ndarray, "f p 16"]:

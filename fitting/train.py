@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -164,7 +165,8 @@ def bake_sequence(
         reference=jnp.zeros((0, 4)), translations=jnp.zeros((0, 3)), mean=jnp.zeros((1, 0)), basis=jnp.zeros((1, 0, 0)),
     )  # fmt: skip
     vertices = np.arange(num_vertices)
-    source = _source_hash(name, [np.asarray(sequence.vertices), np.asarray(sequence.frames), np.asarray(sequence.faces)])
+    arrays = (sequence.vertices, sequence.frames, sequence.faces)
+    source = _source_hash(name, [np.asarray(array) for array in arrays])
     return _bake(
         name, frames, sequence.faces, ShadingPoints(vertices, vertices), np.zeros(num_vertices, np.int32), raw, basis,
         part, np.zeros(num_frames, int), source, settings, store, track,
@@ -183,7 +185,16 @@ def _bake(name, frames, faces, points, groups, raw, basis, part, clip, source, s
     if not visible.any():
         bad_input(name, "vertices", expected="some that see out of the mesh", got="every vertex inside")
     data = TrainingData(
-        name, points, groups, bits, raw, basis, np.asarray(part), np.asarray(clip), settings.bake.num_directions, visible
+        name,
+        points,
+        groups,
+        bits,
+        raw,
+        basis,
+        np.asarray(part),
+        np.asarray(clip),
+        settings.bake.num_directions,
+        visible,
     )
     return data, statistics
 
@@ -346,7 +357,7 @@ def fit_block(
     with the metric of where it stands.
     """
     starts = _starts(sh, num_lobes=fit.num_lobes, count=NUM_STARTS if fit.refine_steps else 1)
-    best = None
+    best: Any = None
     for axes in starts:
         weights = _initial(rows, sh, axes)
         metric = _metric(rows, weights, axes)

@@ -6,8 +6,8 @@ Conventions, the same everywhere (docs/conventions.md has the reasons):
 - Images are `(h, w, c)`, row 0 on top, pixel centres at +0.5, linear RGB float32. Triangle id -1 is empty.
 - Directions are unit and leave the surface: `wo` to the eye, `wi` to the light.
 - A vertex frame has the skinned normal as its z.
-- Spherical harmonics are real, orthonormal, with the Condon-Shortley sign, index `l * (l + 1) + m`; `order` counts bands
-  (order 4 has 16 coefficients). Converters to other layouts: `jaxrender.harmonics.sh_to_layout`.
+- Spherical harmonics are real, orthonormal, with the Condon-Shortley sign, index `l * (l + 1) + m`; `order` counts
+  bands (order 4 has 16 coefficients). Converters to other layouts: `jaxrender.harmonics.sh_to_layout`.
 - Arrays first, then `*`, then options. Pointwise kernels take any leading axes; `jit` and `vmap` are the caller's.
 
 The rooms are subpackages: `jaxrender.io` (files), `jaxrender.animation` (skeletons, skinning, the built-in body),

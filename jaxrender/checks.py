@@ -57,6 +57,4 @@ def check_finite(where: object, field: str, array) -> None:
     finite = np.isfinite(array)
     if not finite.all():
         first = tuple(int(i) for i in np.argwhere(~finite)[0])
-        bad_input(
-            where, field, expected="finite numbers", got=f"{(~finite).sum()} NaN or Inf, first at {first}"
-        )
+        bad_input(where, field, expected="finite numbers", got=f"{(~finite).sum()} NaN or Inf, first at {first}")

@@ -62,9 +62,7 @@ def package_version(name: str) -> str | None:
 
 def problems(found: dict[str, Any]) -> list[str]:
     """What keeps a command from working, one line each; empty if all is well."""
-    lines = [
-        f"the package {name} is missing" for name, version in found["packages"].items() if version is None
-    ]
+    lines = [f"the package {name} is missing" for name, version in found["packages"].items() if version is None]
     if found["devices"]["error"]:
         lines.append(f"JAX has no device: {found['devices']['error']}")
     if not found["rays"]["works"]:

@@ -78,9 +78,7 @@ def ssim(
     )
 
 
-def heatmap(
-    values: Float[Array, "*b"], *, low: float = 0.0, high: float | None = None
-) -> Float[Array, "*b 3"]:
+def heatmap(values: Float[Array, "*b"], *, low: float = 0.0, high: float | None = None) -> Float[Array, "*b 3"]:
     """Numbers as colors, black at `low` over red and orange to pale yellow at `high`; linear RGB.
 
     Values outside are clamped; `high=None` takes the largest value. NaN becomes green, which the scale does

@@ -66,7 +66,8 @@ def make_mesh_sequence(
         raise ValueError(f"features: expected {len(vertices)} frames as in vertices, got {len(features)}")
     index = np.asarray(faces)
     if index.size == 0 or index.min() < 0 or index.max() >= vertices.shape[1]:
-        raise ValueError(f"faces: expected indices below {vertices.shape[1]}, got {index.min(initial=0)}..{index.max(initial=0)}")
+        got = f"{index.min(initial=0)}..{index.max(initial=0)}"
+        raise ValueError(f"faces: expected indices below {vertices.shape[1]}, got {got}")
     neighbour = np.arange(vertices.shape[1])
     for corner in (2, 1, 0):
         neighbour[index[:, corner]] = index[:, (corner + 1) % 3]

@@ -53,9 +53,7 @@ def orthonormal_tangent(n: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     return jnp.stack([1.0 + sign * x * x * a, sign * x * y * a, -sign * x], axis=-1)
 
 
-def frame_from_normal_tangent(
-    normal: Float[Array, "*b 3"], tangent: Float[Array, "*b 3"]
-) -> Float[Array, "*b 3 3"]:
+def frame_from_normal_tangent(normal: Float[Array, "*b 3"], tangent: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
     """World-from-local rotation whose columns are tangent, bitangent and normal (local z = normal).
 
     `tangent` is made orthogonal to the unit `normal` first; one that is parallel to it is replaced by

@@ -37,9 +37,7 @@ def test_look_at_against_cross_products(rng):
 
 @pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), (0.0, -3.0, 0.0)])
 def test_look_at_along_up_is_still_a_rotation(up):
-    rotation = np.asarray(
-        look_at(*(jnp.asarray(v, jnp.float32) for v in ((0.0, 2.0, 0.0), (0.0, 0.0, 0.0), up)))
-    )
+    rotation = np.asarray(look_at(*(jnp.asarray(v, jnp.float32) for v in ((0.0, 2.0, 0.0), (0.0, 0.0, 0.0), up))))
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
     assert np.linalg.det(rotation) > 0.99
     np.testing.assert_allclose(rotation[:, 2], [0, 1, 0], atol=1e-6)
@@ -90,9 +88,7 @@ def test_project_is_the_inverse_of_rays(rng):
     camera = make_camera(eye=(1.0, 2.0, 3.0), target=(0.2, 0.1, 0.0))
     origins, directions = camera_rays(camera, height=6, width=9)
     t = jnp.asarray(rng.uniform(0.5, 4.0, size=(6, 9, 1)), jnp.float32)
-    px, depth = project_px(
-        camera, origins + jnp.broadcast_to(t, directions.shape) * directions, height=6, width=9
-    )
+    px, depth = project_px(camera, origins + jnp.broadcast_to(t, directions.shape) * directions, height=6, width=9)
     columns, rows = np.meshgrid(np.arange(9) + 0.5, np.arange(6) + 0.5)
     # Points a few units away, rounded to 1e-7 relative, seen at a pixel step of 0.2: well below 1e-4 px.
     np.testing.assert_allclose(px, np.stack([columns, rows], axis=-1), atol=1e-4)

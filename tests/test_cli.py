@@ -88,10 +88,7 @@ def test_interrupt_says_what_was_kept(capsys):
             raise KeyboardInterrupt
 
     assert console.run_command(main) == 130
-    assert (
-        capsys.readouterr().err
-        == "interrupted; 12 frames are in out/bake; the same command goes on from there\n"
-    )
+    assert capsys.readouterr().err == "interrupted; 12 frames are in out/bake; the same command goes on from there\n"
 
 
 def test_interrupt_of_a_real_process():
@@ -104,9 +101,7 @@ def main():
         time.sleep(60)
 raise SystemExit(console.run_command(main))
 """
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "ready\n"
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=30)
@@ -166,9 +161,7 @@ class Probe:
 
 
 def test_parse_gives_the_record():
-    assert console.parse(Probe, prog="probe", argv=["--path", "y", "--fast"]) == Probe(
-        pathlib.Path("y"), True
-    )
+    assert console.parse(Probe, prog="probe", argv=["--path", "y", "--fast"]) == Probe(pathlib.Path("y"), True)
 
 
 # --- Progress
@@ -350,9 +343,7 @@ def test_doctor_names_what_is_missing(monkeypatch, capsys, tmp_path, jax_cache):
     (tmp_path / "file").touch()
     jax.config.update("jax_compilation_cache_dir", str(tmp_path / "file" / "cache"))
     known = doctor.package_version
-    monkeypatch.setattr(
-        doctor, "package_version", lambda name: None if name in ("matplotlib", "zarr") else known(name)
-    )
+    monkeypatch.setattr(doctor, "package_version", lambda name: None if name in ("matplotlib", "zarr") else known(name))
     monkeypatch.setitem(sys.modules, "embreex", None)
     assert cli.main(["doctor"]) == 1
     out = capsys.readouterr().out

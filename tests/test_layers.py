@@ -23,7 +23,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "filters": {"ground"},
     "deferred": {"ground", "filters"},
     "pathtrace": {"ground", "filters", "deferred"},
-    "harmonics": {"ground", "pathtrace"},
+    "harmonics": {"ground", "animation", "pathtrace"},
     "commands": {"ground", "animation", "io", "filters", "deferred", "pathtrace", "harmonics"},
 }
 
@@ -137,18 +137,16 @@ def test_no_circles():
 def declared(section: str, key: str) -> set[str]:
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
-    names = [
-        re.split(r"[^A-Za-z0-9_.-]", line)[0] for line in config[section][key].split("\n") if line.strip()
-    ]
+    names = [re.split(r"[^A-Za-z0-9_.-]", line)[0] for line in config[section][key].split("\n") if line.strip()]
     return {IMPORT_NAMES.get(name.lower(), name.replace("-", "_")) for name in names}
 
 
 @pytest.mark.parametrize("name", sorted(n for n in SOURCES if top(n) in ("jaxrender", "fitting", "torchref")))
 def test_only_declared_dependencies_are_imported(name):
     core = declared("options", "install_requires") | set(PACKAGES) | set(sys.stdlib_module_names)
-    # The twins need the extra "torch", and nothing else of ours.
+    # The twins need the extra "torch", safetensors for model files, and nothing else of ours.
     allowed = (
-        {"torch", "numpy", "jaxtyping", "torchref", *sys.stdlib_module_names}
+        {"torch", "numpy", "jaxtyping", "safetensors", "torchref", *sys.stdlib_module_names}
         if top(name) == "torchref"
         else core
     )
@@ -168,9 +166,7 @@ def test_kernels_do_not_print_nor_show_progress(name):
 
 @pytest.mark.parametrize("name", sorted(SOURCES))
 def test_annotations_stay_real(name):
-    assert "__future__" not in imports(name, lazy=False), (
-        f"{name}: jaxtyping needs annotations that are objects"
-    )
+    assert "__future__" not in imports(name, lazy=False), f"{name}: jaxtyping needs annotations that are objects"
 
 
 @pytest.mark.parametrize(

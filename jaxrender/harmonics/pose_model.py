@@ -180,8 +180,10 @@ def project_features(basis: FeatureBasis, raw: Float[Array, "*b g n"]) -> Float[
 
 def predict_numbers(model: PoseModel, components: Float[Array, "g k"]) -> Float[Array, "p d"]:
     """The 6c numbers of each point for one pose: bias + components · weights."""
-    own = components[model.groups].astype(model.weights.dtype)
-    return model.weights[:, 0] + jnp.sum(own[:, :, None] * model.weights[:, 1:], axis=1)
+    own = components[model.groups]
+    # Weights may be stored as float16; the sum is made in the components' precision.
+    weights = model.weights.astype(own.dtype)
+    return weights[:, 0] + jnp.sum(own[:, :, None] * weights[:, 1:], axis=1)
 
 
 def lobes_from_numbers(
@@ -265,11 +267,8 @@ def _check_types(path: Path, arrays: dict[str, np.ndarray]) -> None:
     for name, rank in _RANKS.items():
         if name not in arrays:
             bad_input(path, name, expected="a tensor of this name", got="none")
-        array, allowed = arrays[name], ("float32", "float16")
-        if name in _INDICES:
-            allowed = ("int32", "int64")
-        if name == "visible":
-            allowed = ("bool",)
+        allowed = ["int32", "int64"] if name in _INDICES else ["float32", "float16"]
+        allowed, array = ["bool"] if name == "visible" else allowed, arrays[name]
         if array.dtype.name not in allowed:
             bad_input(path, name, expected=" or ".join(allowed), got=array.dtype.name)
         if array.ndim != rank:

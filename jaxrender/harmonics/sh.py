@@ -12,7 +12,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Inexact
 
 from jaxrender.checks import check_last_axis, check_one_of, check_order
 from jaxrender.vecmath import constant_like, einsum, matmul
@@ -20,7 +20,7 @@ from jaxrender.vecmath import constant_like, einsum, matmul
 LAYOUTS = ("gaussian_splatting", "e3nn", "scipy", "positive")
 
 
-def order_of(sh) -> int:
+def order_of(sh: Inexact[Array, "*b k"]) -> int:
     """Number of bands of a coefficient array, from its last axis; ValueError if that is not a square."""
     order = math.isqrt(sh.shape[-1])
     check_order(order, sh.shape[-1])
@@ -32,7 +32,13 @@ def bands(order: int) -> np.ndarray:
     return np.repeat(np.arange(order), 2 * np.arange(order) + 1)
 
 
-def basis_columns(x, y, z, *, order: int) -> list:
+def basis_columns(
+    x: Float[Array | np.ndarray, "*b"],
+    y: Float[Array | np.ndarray, "*b"],
+    z: Float[Array | np.ndarray, "*b"],
+    *,
+    order: int,
+) -> list[Float[Array | np.ndarray, "*b"]]:
     """The order**2 basis functions as a list of arrays shaped like x; from NumPy or JAX arrays alike.
 
     With (x + iy)^m = c_m + i s_m and the Legendre part Q_l^m(z) = P_l^m(z) / (1 - z²)^{m/2}, normalised,

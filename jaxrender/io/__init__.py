@@ -1,8 +1,8 @@
 """Files to records and back. Every reader checks what it reads and raises InputError in one line."""
 
 from jaxrender.io.bvh import read_bvh as load_bvh  # noqa: F401
+from jaxrender.io.character import load_character as load_character
 from jaxrender.io.exr import read_exr as read_exr
 from jaxrender.io.exr import write_exr as write_exr
 from jaxrender.io.hdr import read_environment as read_environment
 from jaxrender.io.picture import write_png as write_png
-from jaxrender.io.character import load_character as load_character

@@ -78,9 +78,7 @@ def read_exr_layers(path: str | os.PathLike) -> dict[str, Num[np.ndarray, "h w c
             for name, pixels in channels.items():
                 if pixels is None or pixels.shape != (part.height, part.width):
                     expected = f"{part.height} x {part.width} pixels"
-                    checks.bad_input(
-                        path, f"channel {name!r}", expected=expected, got=getattr(pixels, "shape", None)
-                    )
+                    checks.bad_input(path, f"channel {name!r}", expected=expected, got=getattr(pixels, "shape", None))
             for name, members in _group(tuple(channels)).items():
                 full = name if index == 0 else f"{part.name}.{name}" if name else part.name
                 layers[full] = _stack([channels[member] for member in members])
@@ -100,9 +98,7 @@ def read_exr_header(path: str | os.PathLike) -> tuple[ExrPart, ...]:
     if not parts:
         checks.bad_input(path, "header", expected="at least one image", got="none")
     if len({part.name for part in parts}) < len(parts):
-        checks.bad_input(
-            path, "header", expected="parts of different names", got=[part.name for part in parts]
-        )
+        checks.bad_input(path, "header", expected="parts of different names", got=[part.name for part in parts])
     total = sum(part.height * part.width * len(part.channels) for part in parts)
     if total > MAX_VALUES:
         checks.bad_input(path, "data window", expected=f"at most {MAX_VALUES} values", got=f"{total}")
@@ -133,9 +129,7 @@ def write_exr(
         pixels = _storable(layer, np.asarray(pixels), half=half)
         shape = shape or pixels.shape[:2]
         if pixels.shape[:2] != shape:
-            raise ValueError(
-                f"layer {layer!r}: expected {shape} pixels as in the first layer, got {pixels.shape[:2]}"
-            )
+            raise ValueError(f"layer {layer!r}: expected {shape} pixels as in the first layer, got {pixels.shape[:2]}")
         for index, name in enumerate(_channel_names(layer, pixels.shape[-1])):
             if name in channels:
                 raise ValueError(f"layer {layer!r}: expected a new channel name, got {name!r} again")
@@ -160,9 +154,7 @@ def _group(channels: tuple[str, ...]) -> dict[str, list[str]]:
         for prefix in sorted({name.rpartition(".")[0] for name in rest}):
             if prefix == "" and family != "RGBA":
                 continue  # a bare Z is depth and a bare Y is luminance
-            found = {
-                name.rpartition(".")[2].upper(): name for name in rest if name.rpartition(".")[0] == prefix
-            }
+            found = {name.rpartition(".")[2].upper(): name for name in rest if name.rpartition(".")[0] == prefix}
             members = [found[component] for component in family if component in found]
             if members and prefix not in groups and prefix not in channels:
                 groups[prefix] = members
@@ -201,9 +193,7 @@ def _storable(layer: str, pixels: np.ndarray, *, half: bool) -> np.ndarray:
         return pixels.astype(np.float16 if half else np.float32)
     if np.issubdtype(pixels.dtype, np.integer) or pixels.dtype == np.bool_:
         if pixels.min() < 0 or pixels.max() > 2**32 - 1:
-            raise ValueError(
-                f"layer {layer!r}: expected integers of 32 bits without a sign, got a value outside"
-            )
+            raise ValueError(f"layer {layer!r}: expected integers of 32 bits without a sign, got a value outside")
         return pixels.astype(np.uint32)
     raise ValueError(f"layer {layer!r}: expected real numbers, got {pixels.dtype}")
 
@@ -242,9 +232,7 @@ def _open(path: str | os.PathLike, *, header_only: bool) -> Iterator["OpenEXR.Fi
     with path.open("rb") as file:  # a missing or unreadable file is told by the system's own error
         magic = file.read(4)
     if magic != b"\x76\x2f\x31\x01":
-        checks.bad_input(
-            path, "first bytes", expected="an OpenEXR file", got=magic.hex(" ") or "an empty file"
-        )
+        checks.bad_input(path, "first bytes", expected="an OpenEXR file", got=magic.hex(" ") or "an empty file")
     with _quiet() as said:
         try:
             with OpenEXR.File(str(path), separate_channels=True, header_only=header_only) as file:

@@ -19,9 +19,7 @@ _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
-def read_floats(
-    source: Container, index: Any, types: tuple[str, ...], where: str
-) -> Float32[np.ndarray, "n c"]:
+def read_floats(source: Container, index: Any, types: tuple[str, ...], where: str) -> Float32[np.ndarray, "n c"]:
     """An accessor as finite floats; integers marked as normalised become [0, 1] or [-1, 1].
 
     Matrices are (n, 16), in the column-major order of the file.
@@ -42,9 +40,7 @@ def read_floats(
     return values
 
 
-def read_integers(
-    source: Container, index: Any, types: tuple[str, ...], where: str
-) -> Int64[np.ndarray, "n c"]:
+def read_integers(source: Container, index: Any, types: tuple[str, ...], where: str) -> Int64[np.ndarray, "n c"]:
     """An accessor of unsigned integers."""
     raw = _read(source, index, types, where)
     if raw.dtype.kind != "u":
@@ -67,11 +63,7 @@ def _read(source: Container, index: Any, types: tuple[str, ...], where: str) -> 
         values = np.zeros(shape, dtype)
     else:
         values = _strided(source, accessor.bufferView, accessor.byteOffset, shape, dtype, field)
-    return (
-        values
-        if accessor.sparse is None
-        else _substituted(source, values, accessor.sparse, f"{field}.sparse")
-    )
+    return values if accessor.sparse is None else _substituted(source, values, accessor.sparse, f"{field}.sparse")
 
 
 def _strided(source: Container, view_index, offset, shape: tuple[int, int], dtype, field: str) -> np.ndarray:

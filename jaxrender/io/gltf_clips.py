@@ -55,9 +55,7 @@ def _read_channels(source: Container, animation: Any, joint_of: dict[int, int], 
         index, samplers = channel.sampler, animation.samplers
         if index is None or not 0 <= index < len(samplers):
             source.bad(f"{field}.sampler", expected=f"an index into {len(samplers)} samplers", got=index)
-        channels.append(
-            _read_sampler(source, samplers[index], joint, target.path, f"{where}.samplers[{index}]")
-        )
+        channels.append(_read_sampler(source, samplers[index], joint, target.path, f"{where}.samplers[{index}]"))
     return channels
 
 
@@ -77,9 +75,7 @@ def _read_sampler(source: Container, sampler: Any, joint: int, path: Path, where
         middle = values[:, rows_a_key // 2]
         values[:, rows_a_key // 2] = unit_quaternions(source, middle, f"{where}.output")
     if (np.diff(times) < 0).any():
-        source.bad(
-            f"{where}.input", expected="increasing times", got=f"{times[1:][np.diff(times) < 0][0]} too late"
-        )
+        source.bad(f"{where}.input", expected="increasing times", got=f"{times[1:][np.diff(times) < 0][0]} too late")
     # Of keys at one time the last one counts.
     keep = np.append(np.diff(times) > 0, True)
     source.note("animation keys at the time of the next key dropped", int((~keep).sum()))

@@ -43,9 +43,7 @@ def read_albedo(
             albedo = albedo * np.clip(factor[:3], 0.0, 1.0)
             if pbr.baseColorTexture is not None:
                 try:
-                    albedo = albedo * _texture_at(
-                        source, pbr.baseColorTexture, attributes, num_vertices, where
-                    )
+                    albedo = albedo * _texture_at(source, pbr.baseColorTexture, attributes, num_vertices, where)
                 except MissingTexture as reason:
                     source.note(f"base color texture left out ({reason})")
     return albedo.astype(np.float32)
@@ -67,9 +65,7 @@ def sample_bilinear(
     return (1.0 - fy) * upper + fy * lower
 
 
-def _texture_at(
-    source: Container, info: Any, attributes: dict[str, Any], num_vertices: int, where: str
-) -> np.ndarray:
+def _texture_at(source: Container, info: Any, attributes: dict[str, Any], num_vertices: int, where: str) -> np.ndarray:
     transform = info.extensions.get("KHR_texture_transform", {})
     transform = transform if isinstance(transform, dict) else {}
     name = f"TEXCOORD_{transform.get('texCoord', info.texCoord or 0)}"

@@ -38,9 +38,7 @@ def read_surface(source: Container, primitive: Any, num_joints: int | None, wher
     """
     attributes = _attributes(source, primitive, where)
     if primitive.targets:
-        source.bad(
-            f"{where}.targets", expected="no morph targets (not supported)", got=len(primitive.targets)
-        )
+        source.bad(f"{where}.targets", expected="no morph targets (not supported)", got=len(primitive.targets))
     source.spend(_COST_OF_A_PRIMITIVE, where)
     if "KHR_draco_mesh_compression" in primitive.extensions:
         if source.item("accessors", attributes["POSITION"], f"{where}.POSITION").bufferView is None:
@@ -99,9 +97,7 @@ def _read_faces(source: Container, primitive: Any, num_vertices: int, where: str
         odd = start % 2
         return np.stack([corners[start], corners[start + 1 + odd], corners[start + 2 - odd]], axis=-1)
     if mode == _FAN:
-        return np.stack(
-            [corners[start + 1], corners[start + 2], np.broadcast_to(corners[0], start.shape)], axis=-1
-        )
+        return np.stack([corners[start + 1], corners[start + 2], np.broadcast_to(corners[0], start.shape)], axis=-1)
     return source.bad(f"{where}.mode", expected="0 to 6", got=mode)
 
 

@@ -79,9 +79,7 @@ def scene_nodes(source: Container, graph: NodeGraph) -> list[int]:
     return [node for node in graph.order if node in inside]
 
 
-def build_skeleton(
-    source: Container, graph: NodeGraph, needed: Iterable[int]
-) -> tuple[Skeleton, dict[int, int]]:
+def build_skeleton(source: Container, graph: NodeGraph, needed: Iterable[int]) -> tuple[Skeleton, dict[int, int]]:
     """A skeleton of the needed nodes and all above them, and the joint of each of these nodes."""
     wanted: set[int] = set()
     for node in needed:

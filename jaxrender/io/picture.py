@@ -68,9 +68,7 @@ def to_bytes(image: np.ndarray) -> UInt8[np.ndarray, "h w c"]:
     image = np.asarray(image)
     image = image[..., None] if image.ndim == 2 else image
     if image.ndim != 3 or 0 in image.shape or image.shape[-1] not in (1, 3, 4):
-        raise ValueError(
-            f"image: expected shape (h, w) or (h, w, c) with 1, 3 or 4 channels, got {image.shape}"
-        )
+        raise ValueError(f"image: expected shape (h, w) or (h, w, c) with 1, 3 or 4 channels, got {image.shape}")
     if image.dtype == np.uint8:
         return image
     if not np.issubdtype(image.dtype, np.floating):
@@ -109,9 +107,7 @@ def read_png(path: str | os.PathLike) -> Float[np.ndarray, "h w 3"]:
         with PIL.Image.open(path, formats=("PNG",)) as image:
             width, height = image.size
             if width * height > MAX_PIXELS:
-                checks.bad_input(
-                    path, "size", expected=f"at most {MAX_PIXELS} pixels", got=f"{width} x {height}"
-                )
+                checks.bad_input(path, "size", expected=f"at most {MAX_PIXELS} pixels", got=f"{width} x {height}")
             if image.mode.startswith("I"):  # 16 bits, which pillow would clip to 8
                 gray = np.asarray(image, np.float32) / 65535.0
                 return np.repeat(decode_srgb(gray)[..., None], 3, axis=-1).astype(np.float32)
@@ -127,9 +123,7 @@ def read_png(path: str | os.PathLike) -> Float[np.ndarray, "h w 3"]:
     return decode_srgb(pixels / 255.0).astype(np.float32)
 
 
-def write_animation(
-    path: str | os.PathLike, frames: Iterable[np.ndarray], *, fps: int | float = 30.0
-) -> None:
+def write_animation(path: str | os.PathLike, frames: Iterable[np.ndarray], *, fps: int | float = 30.0) -> None:
     """Writes frames as one picture that moves and repeats: WebP, GIF or animated PNG, by the ending.
 
     WebP is the one to choose: all browsers show it, and it is many times smaller than the others. GIF has 256
@@ -157,9 +151,7 @@ def write_animation(
         ".gif": {"optimize": False, "disposal": 1},
     }[path.suffix.lower()]
     if path.suffix.lower() == ".gif":
-        images = [
-            image.convert("RGB").quantize(256, dither=PIL.Image.Dither.FLOYDSTEINBERG) for image in images
-        ]
+        images = [image.convert("RGB").quantize(256, dither=PIL.Image.Dither.FLOYDSTEINBERG) for image in images]
         durations = (10 * np.diff(np.round(edges / 10)).astype(int)).tolist()
     kind = {".webp": "WEBP", ".gif": "GIF", ".png": "PNG"}[path.suffix.lower()]
     with atomic_path(path) as temporary:

@@ -61,9 +61,7 @@ class Report:
 
     def text(self, text: str) -> "Report":
         """Adds prose; an empty line starts a new paragraph."""
-        return self._add(
-            "".join(f"<p>{_escape(part.strip())}</p>" for part in text.split("\n\n") if part.strip())
-        )
+        return self._add("".join(f"<p>{_escape(part.strip())}</p>" for part in text.split("\n\n") if part.strip()))
 
     def note(self, text: str) -> "Report":
         """Adds a remark that should not be overlooked."""
@@ -101,9 +99,7 @@ class Report:
         cells = [_row_cells(row, columns) for row in rows]
         winners = {name: _best(cells, columns.index(name), kind) for name, kind in (best or {}).items()}
         numeric = [all(_is_number(row[i]) or row[i] is None for row in cells) for i in range(len(columns))]
-        head = "".join(
-            f'<th scope="col"{_class(numeric[i])}>{_escape(name)}</th>' for i, name in enumerate(columns)
-        )
+        head = "".join(f'<th scope="col"{_class(numeric[i])}>{_escape(name)}</th>' for i, name in enumerate(columns))
         body = []
         for row in cells:
             line = []
@@ -119,9 +115,7 @@ class Report:
         """Adds a picture: an array (see `picture.to_bytes`), or a PNG, GIF, WebP or JPEG file."""
         return self._add(_figure_html(_image_html(image, caption), caption))
 
-    def images(
-        self, images: Sequence[tuple[np.ndarray | str | os.PathLike, str]], caption: str = ""
-    ) -> "Report":
+    def images(self, images: Sequence[tuple[np.ndarray | str | os.PathLike, str]], caption: str = "") -> "Report":
         """Adds pictures with their own captions beside each other, as many as the width allows."""
         inner = "".join(_figure_html(_image_html(image, label), label) for image, label in images)
         below = f'<p class="caption">{_escape(caption)}</p>' if caption else ""
@@ -167,9 +161,7 @@ class Report:
         """The whole page."""
         contents = ""
         if len(self._sections) > 2:
-            links = "".join(
-                f'<li><a href="#{anchor}">{_escape(title)}</a></li>' for anchor, title in self._sections
-            )
+            links = "".join(f'<li><a href="#{anchor}">{_escape(title)}</a></li>' for anchor, title in self._sections)
             contents = f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
         subtitle = f'<p class="subtitle">{_escape(self._subtitle)}</p>' if self._subtitle else ""
         return (

@@ -1,7 +1,7 @@
 """Vertex colors to an image by first-hit rays: what `fitting` draws its pictures with.
 
-Works on one image; NumPy in, NumPy out. The rays of a pose are cast once (`visible_surface`), coloring it again costs no
-ray.
+Works on one image; NumPy in, NumPy out. The rays of a pose are cast once (`visible_surface`); coloring it again
+costs no ray.
 """
 
 from dataclasses import dataclass
@@ -95,9 +95,7 @@ def render_vertex_colors(
       colors: linear radiance.
       background: one color, or a latitude-longitude map.
     """
-    surface = visible_surface(
-        positions, faces, camera, height=height, width=width, samples_per_axis=samples_per_axis
-    )
+    surface = visible_surface(positions, faces, camera, height=height, width=width, samples_per_axis=samples_per_axis)
     if isinstance(background, np.ndarray) and background.ndim == 3:
         background = environment_background(surface, background)
     return color_surface(surface, faces, colors, background)

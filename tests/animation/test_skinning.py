@@ -39,9 +39,7 @@ def random_skin(rng, *, num_vertices=30, num_influences=3, dtype=np.float32):
     return skinning.Skin(
         vertices=jnp.asarray(rng.normal(size=(num_vertices, 3)), dtype=dtype),
         normals=jnp.asarray(unit(rng.normal(size=(num_vertices, 3))), dtype=dtype),
-        joint_indices=jnp.asarray(
-            rng.integers(0, len(PALETTE), (num_vertices, num_influences)), dtype=jnp.int32
-        ),
+        joint_indices=jnp.asarray(rng.integers(0, len(PALETTE), (num_vertices, num_influences)), dtype=jnp.int32),
         weights=jnp.asarray(weights / weights.sum(-1, keepdims=True), dtype=dtype),
         palette_joints=jnp.asarray(PALETTE, dtype=jnp.int32),
         inverse_binds=jnp.asarray(affine(rng, len(PALETTE)), dtype=dtype),
@@ -138,9 +136,7 @@ def test_mirrored_surface_keeps_its_outside():
 def test_flattened_surface_has_a_normal_and_a_vanished_one_has_none():
     flat = jnp.asarray(np.diag([1.0, 1.0, 0.0]), dtype=jnp.float32)
     np.testing.assert_array_equal(transform_normals(flat, jnp.asarray([0.6, 0.0, 0.8])), [0.0, 0.0, 1.0])
-    np.testing.assert_array_equal(
-        transform_normals(jnp.zeros((3, 3)), jnp.asarray([0.0, 0.0, 1.0])), np.zeros(3)
-    )
+    np.testing.assert_array_equal(transform_normals(jnp.zeros((3, 3)), jnp.asarray([0.0, 0.0, 1.0])), np.zeros(3))
 
 
 def test_batches_and_jit(rng):

@@ -89,9 +89,7 @@ def test_the_file_is_tried_before_anything_is_measured(fake, tmp_path, capsys):
     fake.run = lambda options: pytest.fail("must not be measured")
     (tmp_path / "file").touch()
     assert cli.main(["run", "fake", "--json", str(tmp_path / "file" / "r.json")]) == 2
-    assert (
-        capsys.readouterr().err.splitlines()[-1] == f"jaxrender: error: {tmp_path / 'file'}: Not a directory"
-    )
+    assert capsys.readouterr().err.splitlines()[-1] == f"jaxrender: error: {tmp_path / 'file'}: Not a directory"
 
 
 def test_listed_suites_can_be_loaded():

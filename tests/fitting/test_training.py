@@ -117,7 +117,9 @@ def test_a_model_file_keeps_everything(trained, tmp_path):
     half, _, _ = find_model(tmp_path / "half.safetensors")
     assert load_file(tmp_path / "half.safetensors")["weights"].dtype == np.float16
     rounded = dataclasses.replace(result, model=half)
-    assert global_error(rounded, TRAIN) == pytest.approx(global_error(result, TRAIN), rel=2e-3)  # float16: 5e-4 a number
+    assert global_error(rounded, TRAIN) == pytest.approx(
+        global_error(result, TRAIN), rel=2e-3
+    )  # float16: 5e-4 a number
 
 
 def test_the_split_holds_out_the_end_of_clips_and_whole_clips(character):
@@ -219,7 +221,7 @@ def test_bad_arguments_end_with_one_line_and_status_2(arguments, words, tmp_path
     (tmp_path / "EMPTY").mkdir()
     (tmp_path / "FILE").write_text("a file")
     (tmp_path / "TRUNCATED").write_bytes(b"glTF\x02\x00\x00\x00")
-    places = {name: str(tmp_path / name) for name in ("OUT", "EMPTY", "TRUNCATED")} | {"FILE/below": str(tmp_path / "FILE" / "below")}
+    places = {name: str(tmp_path / name) for name in ("OUT", "EMPTY", "TRUNCATED", "FILE/below")}
     assert main([places.get(word, word) for word in arguments]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert words in "".join(lines) and "Traceback" not in "".join(lines)

@@ -45,9 +45,7 @@ def test_image_and_single_layer(tmp_path, rng):
 def test_half_rounds_to_the_nearest(tmp_path, rng):
     image = rng.random((3, 4, 3)).astype(np.float32)
     exr.write_exr(tmp_path / "x.exr", image, half=True)
-    np.testing.assert_array_equal(
-        exr.read_exr(tmp_path / "x.exr"), image.astype(np.float16).astype(np.float32)
-    )
+    np.testing.assert_array_equal(exr.read_exr(tmp_path / "x.exr"), image.astype(np.float16).astype(np.float32))
 
 
 def test_channel_names_are_those_other_programs_expect(tmp_path, rng):
@@ -59,9 +57,9 @@ def test_channel_names_are_those_other_programs_expect(tmp_path, rng):
 
 
 def write_raw(path, channels, **header):
-    OpenEXR.File(
-        {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}, channels
-    ).write(str(path))
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}, channels).write(
+        str(path)
+    )
 
 
 def test_families_are_ordered_by_meaning_not_by_letter(tmp_path):
@@ -139,9 +137,7 @@ def test_a_giant_data_window_is_refused_before_decoding(tmp_path, rng):
         ((65535, 65535), "at most 536870912 values"),
     ]:
         window = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
-        (tmp_path / "big.exr").write_bytes(
-            data[: window + 8] + struct.pack("<2i", *corner) + data[window + 16 :]
-        )
+        (tmp_path / "big.exr").write_bytes(data[: window + 8] + struct.pack("<2i", *corner) + data[window + 16 :])
         with pytest.raises(InputError, match=message):
             exr.read_exr(tmp_path / "big.exr")
 
@@ -158,9 +154,7 @@ def test_giant_tiles_are_refused_before_decoding(tmp_path, rng):
     data = (tmp_path / "x.exr").read_bytes()
     size = data.index(b"tiledesc\0") + len(b"tiledesc\0") + 4
     (tmp_path / "big.exr").write_bytes(data[:size] + struct.pack("<2I", 32, 2**28) + data[size + 8 :])
-    with pytest.raises(
-        InputError, match="tiles: expected tiles of at most 67108864 values, got 32 x 268435456"
-    ):
+    with pytest.raises(InputError, match="tiles: expected tiles of at most 67108864 values, got 32 x 268435456"):
         exr.read_exr(tmp_path / "big.exr")
 
 
@@ -174,9 +168,7 @@ def test_names_that_are_no_text(tmp_path, rng):
 
 def test_other_files_and_missing_ones(tmp_path):
     (tmp_path / "text.exr").write_text("not an image")
-    with pytest.raises(
-        InputError, match=r"text\.exr: first bytes: expected an OpenEXR file, got 6e 6f 74 20"
-    ):
+    with pytest.raises(InputError, match=r"text\.exr: first bytes: expected an OpenEXR file, got 6e 6f 74 20"):
         exr.read_exr(tmp_path / "text.exr")
     with pytest.raises(FileNotFoundError):
         exr.read_exr(tmp_path / "none.exr")

@@ -54,9 +54,7 @@ def posed(character: Character, world: np.ndarray) -> np.ndarray:
     """Corners of the posed faces (t, 3, 3): comparable however the vertices are ordered or shared."""
     skin = character.skin
     palette = world[np.asarray(skin.palette_joints)] @ np.asarray(skin.inverse_binds, dtype=np.float64)
-    blended = (np.asarray(skin.weights)[..., None, None] * palette[np.asarray(skin.joint_indices)]).sum(
-        axis=1
-    )
+    blended = (np.asarray(skin.weights)[..., None, None] * palette[np.asarray(skin.joint_indices)]).sum(axis=1)
     points = np.einsum("vij,vj->vi", blended[:, :3, :3], skin.vertices) + blended[:, :3, 3]
     return points[np.asarray(character.faces)]
 
@@ -427,9 +425,7 @@ def test_skin_that_mirrors_twice_is_left_alone(tmp_path):
     """Only the product of joint and inverse bind matrix decides."""
     b = tetrahedron()
     b.json["nodes"][0]["scale"] = [-1, 1, 1]
-    binds = np.linalg.inv(
-        np.array([np.diag([-1, 1, 1, 1]), [[-1, 0, 0, 0], [0, 1, 0, 2], [0, 0, 1, 0], [0, 0, 0, 1]]])
-    )
+    binds = np.linalg.inv(np.array([np.diag([-1, 1, 1, 1]), [[-1, 0, 0, 0], [0, 1, 0, 2], [0, 0, 1, 0], [0, 0, 0, 1]]]))
     b.json["skins"][0]["inverseBindMatrices"] = b.accessor(binds.swapaxes(1, 2).reshape(-1, 16))
     character = load(b, tmp_path)
     np.testing.assert_array_equal(character.faces, g.FACES)
@@ -516,9 +512,7 @@ def test_skinned_mesh_ignores_the_transform_of_its_node(tmp_path):
 def test_deep_chain_of_nodes(tmp_path):
     b = rigid()
     depth = 1200
-    b.json["nodes"] = [{"children": [i + 1], "translation": [0.5, 0, 0]} for i in range(depth)] + [
-        {"mesh": 0}
-    ]
+    b.json["nodes"] = [{"children": [i + 1], "translation": [0.5, 0, 0]} for i in range(depth)] + [{"mesh": 0}]
     character = load(b, tmp_path)
     assert len(character.skeleton.names) == depth + 1
     np.testing.assert_allclose(posed(character, rest_matrices(character))[0, 0], [600, 0, 0], rtol=1e-6)
@@ -746,9 +740,7 @@ def test_texture_follows_the_vertices_of_flat_shading(tmp_path):
 def test_texture_transform_turns_counter_clockwise_in_the_image(tmp_path):
     """A quarter turn takes u to -v (v points down), the offset brings it back into the image."""
     b = tetrahedron()
-    textured(
-        b, {"bufferView": b.view(png(PIXELS))}, uv=[[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]]
-    )
+    textured(b, {"bufferView": b.view(png(PIXELS))}, uv=[[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
     info = b.json["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
     transform = {"rotation": math.pi / 2, "offset": [0.0, 1.0]}
     info["extensions"] = {"KHR_texture_transform": transform}
@@ -762,9 +754,7 @@ def test_texture_transform_turns_counter_clockwise_in_the_image(tmp_path):
 @pytest.mark.parametrize("size", [(1, 1), (3, 4), (5, 2)])
 def test_bilinear_lookup_against_a_loop(rng, wrap_u, size):
     image = rng.integers(0, 256, size=(*size, 3), dtype=np.uint8)
-    uv = np.vstack([rng.uniform(-3, 3, size=(40, 2)), [[0, 0], [1, 1], [2, -2], [1e6, 0.5]]]).astype(
-        np.float32
-    )
+    uv = np.vstack([rng.uniform(-3, 3, size=(40, 2)), [[0, 0], [1, 1], [2, -2], [1e6, 0.5]]]).astype(np.float32)
     got = sample_bilinear(image, uv, wrap_u=wrap_u, wrap_v=33071)
 
     def decoded(c):
@@ -918,9 +908,7 @@ def sparse(**fields: Any):
 
 def draco(b: GltfBuilder) -> None:
     """Compressed data alone, though the extension is not declared as required."""
-    primitive(b)["extensions"] = {
-        "KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}
-    }
+    primitive(b)["extensions"] = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
     del b.json["accessors"][0]["bufferView"]
 
 

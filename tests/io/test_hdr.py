@@ -10,9 +10,7 @@ from jaxrender.io.hdr import read_environment
 PIXEL = bytes([128, 64, 32, 129])  # mantissas / 256 x 2^(129 - 128): (1, 0.5, 0.25)
 
 
-def write_hdr(
-    path, *, width=4, height=2, head=b"FORMAT=32-bit_rle_rgbe\n", order=b"-Y %d +X %d", pixels=None
-):
+def write_hdr(path, *, width=4, height=2, head=b"FORMAT=32-bit_rle_rgbe\n", order=b"-Y %d +X %d", pixels=None):
     pixels = PIXEL * (width * height) if pixels is None else pixels
     path.write_bytes(b"#?RADIANCE\n" + head + b"\n" + order % (height, width) + b"\n" + pixels)
     return path
@@ -33,9 +31,7 @@ def test_run_length_code(tmp_path):
 
 def test_exposure_is_divided_out(tmp_path):
     head = b"FORMAT=32-bit_rle_rgbe\nEXPOSURE=2.0\n"
-    np.testing.assert_array_equal(
-        read_environment(write_hdr(tmp_path / "x.hdr", head=head))[0, 0], [0.5, 0.25, 0.125]
-    )
+    np.testing.assert_array_equal(read_environment(write_hdr(tmp_path / "x.hdr", head=head))[0, 0], [0.5, 0.25, 0.125])
 
 
 def test_the_content_counts_not_the_ending(tmp_path, rng):
@@ -51,9 +47,7 @@ def test_gray_and_alpha(tmp_path, rng):
     exr.write_exr(tmp_path / "rgba.exr", image)
     np.testing.assert_array_equal(read_environment(tmp_path / "rgba.exr"), image[..., :3])
     exr.write_exr(tmp_path / "gray.exr", image[..., :1])
-    np.testing.assert_array_equal(
-        read_environment(tmp_path / "gray.exr"), np.repeat(image[..., :1], 3, axis=-1)
-    )
+    np.testing.assert_array_equal(read_environment(tmp_path / "gray.exr"), np.repeat(image[..., :1], 3, axis=-1))
 
 
 def test_bad_values_are_counted_or_cleaned(tmp_path):

@@ -10,9 +10,7 @@ from jaxrender.io import picture
 
 def test_srgb_known_values_and_inverse():
     # IEC 61966-2-1: the linear piece ends at 0.0031308 (0.04045 encoded); mid gray 0.5 is 0.21404 linear.
-    np.testing.assert_allclose(
-        picture.decode_srgb(np.array([0.04045, 0.5, 1.0])), [0.0031308, 0.21404, 1.0], rtol=1e-4
-    )
+    np.testing.assert_allclose(picture.decode_srgb(np.array([0.04045, 0.5, 1.0])), [0.0031308, 0.21404, 1.0], rtol=1e-4)
     x = np.linspace(0.0, 1.0, 1001)
     # The two pieces of the standard meet only to 6 digits, so the inverse is off by that at the joint.
     np.testing.assert_allclose(picture.decode_srgb(picture.encode_srgb(x)), x, atol=1e-6)

@@ -40,12 +40,8 @@ def make_page(tmp_path):
     picture.write_animation(tmp_path / "a.webp", [image, image[::-1]])
     report = Report("Title", subtitle=HOSTILE)
     report.section("One " + HOSTILE).text(HOSTILE + "\n\nsecond").note(HOSTILE).facts({HOSTILE: HOSTILE})
-    report.section("Two").image(image, HOSTILE).image(tmp_path / "a.webp").images(
-        [(image, "a"), (image, "b")], HOSTILE
-    )
-    report.subsection("Sub").table(
-        [{"a": 1, HOSTILE: HOSTILE}, {"a": None}], caption=HOSTILE, best={"a": "min"}
-    )
+    report.section("Two").image(image, HOSTILE).image(tmp_path / "a.webp").images([(image, "a"), (image, "b")], HOSTILE)
+    report.subsection("Sub").table([{"a": 1, HOSTILE: HOSTILE}, {"a": None}], caption=HOSTILE, best={"a": "min"})
     report.section("Three").plot(lambda figure: figure.subplots().plot([0, 1], label=HOSTILE), HOSTILE)
     return report
 
@@ -81,9 +77,7 @@ def test_contents_list_appears_with_three_sections(tmp_path):
 
 
 def test_table_alignment_and_best():
-    report = Report("t").table(
-        [["x", 2.0, 5], ["y", 1.0, None]], ["name", "error", "count"], best={"error": "min"}
-    )
+    report = Report("t").table([["x", 2.0, 5], ["y", 1.0, None]], ["name", "error", "count"], best={"error": "min"})
     source = report.html()
     assert '<td class="number"><strong>1.000</strong></td>' in source
     assert '<td class="number">2.000</td>' in source

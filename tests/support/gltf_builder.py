@@ -51,9 +51,7 @@ class GltfBuilder:
         text = json.dumps(self._with_buffer({})).encode()
         text += b" " * (-len(text) % 4)
         blob = bytes(self.blob)
-        body = (
-            struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob
-        )
+        body = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob
         return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
 
     def gltf(self, uri: str | None = None) -> bytes:

@@ -52,20 +52,14 @@ def project(function: Callable[[np.ndarray], np.ndarray], order: int, degree: in
     return (weights * function(directions)) @ real_harmonics(directions, order)
 
 
-def zonal_coefficients(
-    profile: Callable[[np.ndarray], np.ndarray], order: int, low: float, high: float
-) -> np.ndarray:
+def zonal_coefficients(profile: Callable[[np.ndarray], np.ndarray], order: int, low: float, high: float) -> np.ndarray:
     """z_l of a function of x = cos θ that is smooth on [low, high] and zero elsewhere."""
     t, w = legendre.leggauss(200)
     x, w = (low + high + (high - low) * t) / 2.0, w * (high - low) / 2.0
     values = w * profile(x)
     return np.array(
         [
-            2.0
-            * np.pi
-            * math.sqrt((2 * l + 1) / (4 * np.pi))
-            * values
-            @ legendre.legval(x, [0.0] * l + [1.0])
+            2.0 * np.pi * math.sqrt((2 * l + 1) / (4 * np.pi)) * values @ legendre.legval(x, [0.0] * l + [1.0])
             for l in range(order)
         ]
     )
@@ -79,9 +73,7 @@ def triple_products(order: int) -> np.ndarray:
     return np.einsum("q,qi,qj,qk->ijk", weights, y, y, y, optimize=True)
 
 
-def operator_matrix(
-    profile: Callable[[np.ndarray], np.ndarray], order: int, num_nodes: int = 400
-) -> np.ndarray:
+def operator_matrix(profile: Callable[[np.ndarray], np.ndarray], order: int, num_nodes: int = 400) -> np.ndarray:
     """∫ over the upper hemisphere of f(cos θ) y_i y_j, node by node on the sphere.
 
     Nodes are placed in t with cos θ = t⁴, which smooths an f like cos^0.37 at the horizon.

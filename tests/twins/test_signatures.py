@@ -55,10 +55,7 @@ def modules() -> list[str]:
 
 
 def public_names(package: str, module: str) -> dict[str, Any]:
-    """Functions and records that a module defines, by their full name without the package.
-
-    A class that is no record is machinery (a solver, say), and has no partner.
-    """
+    """Functions and records that a module defines, by their full name without the package."""
     loaded = importlib.import_module(f"{package}.{module}")
     return {
         f"{module}.{name}": value

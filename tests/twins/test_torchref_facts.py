@@ -12,6 +12,7 @@ from torch import Tensor
 
 from tests.support import oracles
 from tests.support.asserts import assert_close
+from tests.support.tolerances import TIGHT
 from torchref import vecmath
 from torchref.animation import skeleton, skinning
 from torchref.harmonics import (
@@ -25,8 +26,6 @@ from torchref.harmonics import (
     zh,
     zh_fit,
 )
-
-TIGHT = 4096.0  # ulps of float64, see tests/support/tolerances.py
 
 
 def tensor(array) -> Tensor:
