@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -99,7 +100,7 @@ class VisibilityStore:
           source: hash of the character, its poses and points.
         """
         self.path, self.num_frames = path, num_frames
-        header = {
+        header: dict[str, Any] = {
             "format": "jaxrender-visibility",
             "version": STORE_VERSION,
             "source": source,

@@ -105,8 +105,8 @@ def sum_errors(predicted: SH, baked: SH, *, floor: float = NORM_FLOOR) -> ErrorS
     """Error sums of some points."""
     error, truth = _band_squares(predicted - baked), _band_squares(baked)
     relative = relative_errors(predicted, baked, floor=floor)
-    sums = (x.sum(axis=1, dtype=np.float64) for x in (error, truth, relative, relative**2))
-    return ErrorSums(*sums, num_points=baked.shape[1])
+    e, t, r, r2 = (x.sum(axis=1, dtype=np.float64) for x in (error, truth, relative, relative**2))
+    return ErrorSums(e, t, r, r2, num_points=baked.shape[1])
 
 
 def relative_errors(predicted: SH, baked: SH, *, floor: float = NORM_FLOOR) -> Float[np.ndarray, "f n"]:
@@ -459,8 +459,8 @@ def shading_errors(transfer: SH, cosine: SH, part: Int[np.ndarray, " f"]) -> dic
     """Relative RMS of diffuse shading, pooled over the lights of each set, by set of frames."""
     errors = {}
     for name, lights in light_sets().items():
-        error = np.sum(((transfer - cosine) @ lights.T) ** 2, axis=(1, 2), dtype=np.float64)
-        truth = np.sum((cosine @ lights.T) ** 2, axis=(1, 2), dtype=np.float64)
+        error = np.asarray(np.sum(((transfer - cosine) @ lights.T) ** 2, axis=(1, 2), dtype=np.float64))
+        truth = np.asarray(np.sum((cosine @ lights.T) ** 2, axis=(1, 2), dtype=np.float64))
         masks = part_masks(part).items()
         errors[name] = {label: _relative(error[m].sum(), truth[m].sum()) if m.any() else None for label, m in masks}
     return errors

@@ -141,7 +141,8 @@ def articulating_joints(character: Character) -> Int[np.ndarray, " i"]:
     """
     parents = character.skeleton.parents
     lines = [set(ancestors(parents, joint)) for joint in influencing_joints(character)]
-    return np.array(sorted(set().union(*lines) - set.intersection(*lines)), int)
+    some, every = set[int]().union(*lines), set(lines[0]).intersection(*lines)
+    return np.array(sorted(some - every), int)
 
 
 def ancestors(parents: tuple[int, ...], joint: int) -> list[int]:

@@ -94,7 +94,8 @@ def traced_colors(
     for start in range(0, len(points), 512):
         own = slice(start, start + 512)
         colors[own] = _integrate(
-            bits[own], positions[own], frames[own], jnp.asarray(light), jnp.asarray(eye, jnp.float32), jnp.float32(exponent), tau,
+            bits[own], positions[own], frames[own], jnp.asarray(light), jnp.asarray(eye, jnp.float32),
+            jnp.float32(exponent), tau,
             jnp.asarray(local, jnp.float32), material,
         )  # fmt: skip
     colors[~np.asarray(model.visible)[np.asarray(model.points)]] = 0.0

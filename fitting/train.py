@@ -2,6 +2,7 @@
 
 import functools
 import hashlib
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -331,8 +332,10 @@ def fit_model(data: TrainingData, fit: FitSettings, *, ridge: float, track: Trac
         return fit_block(rows, block_sh(bits[:, block.padded], data.table), fit)
 
     # XLA runs each block on its calling thread (jaxrender.machine); two blocks at a time keep two cores busy.
+    # The first block alone compiles what all share.
+    first = solve(todo[0])
     with ThreadPoolExecutor(num_cores()) as threads:
-        solutions = threads.map(solve, todo)
+        solutions = itertools.chain([first], threads.map(solve, todo[1:]))
         for block in track(iter(todo), len(todo), "fit"):
             solved, n = next(solutions), len(block.points)
             numbers[block.points] = np.swapaxes(solved[0], 0, 1)[:n]

@@ -25,10 +25,10 @@ class Demo:
     """Print one JSON object instead of the list of files."""
 
     def run(self) -> None:
-        from fitting import cli  # the one place where jaxrender calls a package above it
+        from fitting.cli import run_demo  # the one place where jaxrender calls a package above it
 
         console.enable_compilation_cache()
-        cli.run_demo(self)
+        run_demo(self)
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,10 @@ class Relight:
             raise ValueError(f"--fps: expected a number above 0, got {self.fps}")
 
     def run(self) -> None:
-        from fitting import cli
+        from fitting.cli import run_relight
 
         console.enable_compilation_cache()
-        cli.run_relight(self)
+        run_relight(self)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ differentiable everywhere, poles included. Checked to order 10.
 import functools
 import itertools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -46,8 +47,15 @@ def basis_columns(
     recurrence upward in l, which is stable.
     """
     columns: list = [None] * order**2
-    c, s = 1.0, 0.0
+    c: Any = 1.0
+    s: Any = 0.0
+    q: Any
+    previous: Any
     diagonal = 1.0 / math.sqrt(4.0 * math.pi)
+    previous: Any
+    q: Any
+    c: Any
+    s: Any
     for m in range(order):
         # Q of l = m is a number, of l = m+1 a multiple of z; the factors of both columns go in here.
         previous, q = 0.0, diagonal * ((-1) ** m * math.sqrt(2.0) if m else 1.0)

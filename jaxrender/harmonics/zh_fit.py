@@ -112,7 +112,7 @@ def _solve_factored(low: list[list], rhs: list) -> list:
     return y
 
 
-class _SmallNormalEquations(lineax.AbstractLinearSolver):
+class SmallNormalEquations(lineax.AbstractLinearSolver):
     """Least squares of a few unknowns by their normal equations and `_cholesky`, in plain elementwise arithmetic.
 
     The damping of Levenberg-Marquardt keeps them well conditioned. Under `vmap` a factorisation per vertex would
@@ -121,23 +121,28 @@ class _SmallNormalEquations(lineax.AbstractLinearSolver):
     """
 
     def init(self, operator, options):
+        """Factors the normal equations; the state is the matrix and its factor."""
         matrix = operator.as_matrix()
         n = matrix.shape[1]
         return matrix, _cholesky([[jnp.sum(matrix[:, i] * matrix[:, j]) for j in range(n)] for i in range(n)])
 
     def compute(self, state, vector, options):
+        """Solves for one right-hand side."""
         matrix, low = state
         flat, _ = jax.flatten_util.ravel_pytree(vector)
         solution = _solve_factored(low, list(jnp.sum(matrix * flat[:, None], axis=0)))
         return jnp.stack(solution), lineax.RESULTS.successful, {}
 
     def transpose(self, state, options):
+        """Not needed by the search."""
         raise NotImplementedError
 
     def conj(self, state, options):
+        """The same: all is real."""
         return state, options
 
     def assume_full_rank(self):
+        """Always, thanks to the damping."""
         return True
 
 
@@ -265,7 +270,7 @@ def _misfit_tangent(order, anchor, primals, tangents):
 def _refine_axes(sh, start, *, order, anchor, num_steps):
     """Levenberg-Marquardt over the chart coordinates of axes (c, 3) that serve all rows of sh (n, k)."""
     reference = reference_frames(start)
-    solver = optimistix.LevenbergMarquardt(rtol=1e-5, atol=1e-6, linear_solver=_SmallNormalEquations())
+    solver = optimistix.LevenbergMarquardt(rtol=1e-5, atol=1e-6, linear_solver=SmallNormalEquations())
     found = optimistix.least_squares(
         lambda chart, data: _misfit_with_matrix(chart, *data, order, anchor),
         solver,
