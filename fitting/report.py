@@ -59,7 +59,8 @@ def _summary(report: Report, result: TrainResult, evaluation: Evaluation, model_
         "points that see nothing (masked)": f"{evaluation.invisible_share:.1%}",
         "ridge": result.ridge,
         "model file": console.format_bytes(model_path.stat().st_size),
-        "pose matrices": f"{console.format_bytes(weights.nbytes)} as {weights.dtype}, {weights.shape[1] - 1} components",
+        "pose matrices": f"{console.format_bytes(weights.nbytes)} as {weights.dtype}",
+        "pose components": weights.shape[1] - 1,
         "traced": f"{result.bake.num_rays / 1e6:.0f} M rays at {result.bake.rays_per_second / 1e6:.1f} M per second",
     }
     report.facts({name: "-" if value is None else value for name, value in facts.items()})

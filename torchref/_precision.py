@@ -32,7 +32,7 @@ def in_float64(kernel: Kernel) -> Kernel:
         finally:
             _depth.reset(token)
 
-    return rounded
+    return rounded  # type: ignore[return-value]
 
 
 def _tensors(value: Any) -> list[torch.Tensor]:

@@ -105,8 +105,9 @@ def surroundings(
       n = 13 numbers per joint: 3 + 1 + 9.
     """
     a = size / 9.0
-    at, turned = globals[..., joints, :3, 3], _unit_columns(globals[..., joints, :3, :3])
-    home, frame = globals[..., bones, :3, 3], _unit_columns(globals[..., bones, :3, :3])
+    positions, turns = globals[..., :3, 3], _unit_columns(globals[..., :3, :3])
+    at, turned = positions[..., joints, :], turns[..., joints, :, :]
+    home, frame = positions[..., bones, :], turns[..., bones, :, :]
     p = einsum("...gji,...gkj->...gki", frame, at[..., None, :, :] - home[..., :, None, :])
     r2 = jnp.sum(p * p, axis=-1, keepdims=True)
     axes = einsum("...gji,...kjl->...gkil", frame, turned)
@@ -205,7 +206,7 @@ def predict_lobes(
     References:
       Nowrouzezahrai et al., "Shadowed Relighting of Dynamic Geometry with 1D BRDFs", section 4.3, step 1.
     """
-    numbers = predict_numbers(model, components).astype(jnp.float32)
+    numbers = predict_numbers(model, components).astype(model.axes.dtype)
     return lobes_from_numbers(numbers, model.axes)
 
 

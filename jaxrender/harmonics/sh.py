@@ -52,10 +52,6 @@ def basis_columns(
     q: Any
     previous: Any
     diagonal = 1.0 / math.sqrt(4.0 * math.pi)
-    previous: Any
-    q: Any
-    c: Any
-    s: Any
     for m in range(order):
         # Q of l = m is a number, of l = m+1 a multiple of z; the factors of both columns go in here.
         previous, q = 0.0, diagonal * ((-1) ** m * math.sqrt(2.0) if m else 1.0)

@@ -40,7 +40,8 @@ def lobes_to_sh(coefficients: Float[Tensor, "*#b c l"], axes: Float[Tensor, "*#b
 def legendre(x: Float[Tensor, "*b"], *, order: int) -> Float[Tensor, "*b l"]:
     """P_0 .. P_{order-1} at x: P_l(x) = 2^-l Σ_k C(l,k)² (x-1)^(l-k) (x+1)^k."""
     columns = [
-        sum(math.comb(l, k) ** 2 * (x - 1.0) ** (l - k) * (x + 1.0) ** k for k in range(l + 1)) / 2.0**l
+        torch.zeros_like(x)
+        + sum(math.comb(l, k) ** 2 * (x - 1.0) ** (l - k) * (x + 1.0) ** k for k in range(l + 1)) / 2.0**l
         for l in range(order)
     ]
     return torch.stack(columns, dim=-1)
