@@ -418,6 +418,7 @@ def thin(data: TrainingData, points: Int[np.ndarray, " n"], step: int = 1) -> Tr
         part=data.part[frames],
         clip=data.clip[frames],
         visible=data.visible[points],
+        source=data.source if step == 1 else None,  # it counts frames, all of them
     )
 
 

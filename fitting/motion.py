@@ -21,6 +21,7 @@ class Motion:
     """f poses, where they come from and what they are for.
 
     `clip` indexes `clip_names` (-1 for mixed poses), `time` is in seconds, `part` is TRAIN, SEGMENT, CLIP or MIXED.
+    `source` tells for each joint which frame its rotation was taken from: the frame itself unless the pose is mixed.
     """
 
     pose: Pose
@@ -28,6 +29,7 @@ class Motion:
     time: Float[np.ndarray, " f"]
     part: Int[np.ndarray, " f"]
     clip_names: tuple[str, ...]
+    source: Int[np.ndarray, "f j"]
 
     def __len__(self) -> int:
         return len(self.clip)
@@ -60,7 +62,9 @@ def sample_motion(character: Character, bake: BakeSettings, split: SplitSettings
         if index not in held_out and count >= 5:
             part[first_held:] = SEGMENT
         parts.append(part)
-    motion = Motion(_concatenate(poses), np.concatenate(clips), np.concatenate(times), np.concatenate(parts), names)
+    own = np.repeat(np.arange(counts.sum())[:, None], len(character.skeleton.parents), axis=1)
+    labels = (np.concatenate(values) for values in (clips, times, parts))
+    motion = Motion(_concatenate(poses), *labels, clip_names=names, source=own)
     if motion.where(TRAIN).sum() < 2:
         got = f"{motion.where(TRAIN).sum()} of {len(motion)} (clips of one frame hold no motion)"
         bad_input(character.name, "training frames", expected="at least 2", got=got)
@@ -108,6 +112,7 @@ def add_mixed_poses(motion: Motion, character: Character, count: int, *, seed: i
         np.concatenate([motion.time, np.zeros(count, np.float32)]),
         np.concatenate([motion.part, np.full(count, MIXED)]),
         motion.clip_names,
+        np.concatenate([motion.source, chosen]),
     )
 
 

@@ -1,5 +1,6 @@
 """Training: bake visibility, choose the ridge, solve, refine. Returns a result and prints nothing."""
 
+import dataclasses
 import functools
 import hashlib
 import itertools
@@ -66,7 +67,8 @@ def no_tracking(items: Iterator, _count: int, _label: str) -> Iterator:
 class TrainingData:
     """Baked visibility and the poses it belongs to; f frames, p points, g groups.
 
-    `part` says what each frame is for (fitting.motion), `clip` which clip it is from.
+    `part` says what each frame is for (fitting.motion), `clip` which clip it is from, `source` which frames the limbs
+    of a mixed pose are from.
     """
 
     name: str
@@ -79,6 +81,7 @@ class TrainingData:
     clip: Int[np.ndarray, " f"]
     num_directions: int
     visible: Bool[np.ndarray, " p"]
+    source: Int[np.ndarray, "f j"] | None = None
 
     def frame_weights(self, mixed_weight: float) -> Float[np.ndarray, " f"]:
         """1 for training frames, `mixed_weight` for mixed poses, 0 for what is held out."""
@@ -140,7 +143,7 @@ def bake_character(
         character.name, frames, character.faces, points, groups, raw, basis, motion.part, motion.clip,
         source, settings, store, track,
     )  # fmt: skip
-    return data, statistics, motion
+    return dataclasses.replace(data, source=motion.source), statistics, motion
 
 
 def bake_sequence(
@@ -254,7 +257,9 @@ def choose_ridge(data: TrainingData, fit: FitSettings, *, max_points: int = 1200
         own = sh[:, data.groups[points] == g].reshape(len(sh), -1).astype(np.float64)
         a = (data.raw[:, g] - np.asarray(basis.mean)[g]) @ np.asarray(basis.basis)[g].astype(np.float64)
         for i, left_out in enumerate(folds):
-            w = np.where(left_out, 0.0, weights)
+            # A mixed pose with a limb of a left-out frame would give it away.
+            hidden = left_out if data.source is None else left_out[data.source].any(axis=1)
+            w = np.where(hidden, 0.0, weights)
             mean_a, mean_b = w @ a / w.sum(), w @ own / w.sum()
             centred, rest = a - mean_a, own - mean_b
             gram, moment = centred.T @ (w[:, None] * centred), centred.T @ (w[:, None] * rest)

@@ -112,7 +112,7 @@ def _solve_factored(low: list[list], rhs: list) -> list:
     return y
 
 
-class SmallNormalEquations(lineax.AbstractLinearSolver):
+class _SmallNormalEquations(lineax.AbstractLinearSolver):
     """Least squares of a few unknowns by their normal equations and `_cholesky`, in plain elementwise arithmetic.
 
     The damping of Levenberg-Marquardt keeps them well conditioned. Under `vmap` a factorisation per vertex would
@@ -270,7 +270,7 @@ def _misfit_tangent(order, anchor, primals, tangents):
 def _refine_axes(sh, start, *, order, anchor, num_steps):
     """Levenberg-Marquardt over the chart coordinates of axes (c, 3) that serve all rows of sh (n, k)."""
     reference = reference_frames(start)
-    solver = optimistix.LevenbergMarquardt(rtol=1e-5, atol=1e-6, linear_solver=SmallNormalEquations())
+    solver = optimistix.LevenbergMarquardt(rtol=1e-5, atol=1e-6, linear_solver=_SmallNormalEquations())
     found = optimistix.least_squares(
         lambda chart, data: _misfit_with_matrix(chart, *data, order, anchor),
         solver,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.ndimage import map_coordinates, zoom
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from jaxrender.camera import Camera, camera_rays
 from jaxrender.checks import check_at_least
@@ -41,7 +41,7 @@ def visible_surface(
     check_at_least("samples_per_axis", samples_per_axis, 1)
     size = height * samples_per_axis, width * samples_per_axis
     # About the eye, so that Embree's single precision does not suffer far from the origin.
-    origins, directions = camera_rays(camera, height=size[0], width=size[1])
+    _, directions = camera_rays(camera, height=size[0], width=size[1])
     eye = np.asarray(camera.eye, np.float64)
     scene = EmbreeScene(np.asarray(positions, np.float64) - eye, faces)
     rays = np.ascontiguousarray(np.asarray(directions, np.float32).reshape(-1, 3))
@@ -107,11 +107,11 @@ def environment_background(
 
     Args:
       environment: row 0 is +Y, the middle looks down -Z, columns turn towards +X.
-      blur_degrees: width of the boxes that the map is averaged over first; 0 leaves it sharp.
+      blur_degrees: standard deviation of a Gaussian that the map is smoothed with first, at its equator.
     """
     if blur_degrees > 0:
-        rows = max(1, round(environment.shape[0] * blur_degrees / 180.0))
-        environment = _averaged(environment, rows)
+        sigma = blur_degrees / 180.0 * environment.shape[0]
+        environment = gaussian_filter(environment, (sigma, sigma, 0.0), mode=("nearest", "wrap", "nearest"))
     _, directions = camera_rays(camera, height=height, width=width)
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
     eh, ew = environment.shape[:2]
@@ -120,3 +120,28 @@ def environment_background(
     where = np.stack([np.clip(row, 0, eh - 1), column])
     channels = [map_coordinates(c, where, order=1, mode="grid-wrap") for c in np.moveaxis(environment, -1, 0)]
     return np.stack(channels, axis=-1).astype(np.float32)
+
+
+def render_vertex_colors(
+    positions: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "t 3"],
+    colors: Float[np.ndarray, "v 3"],
+    camera: Camera,
+    *,
+    height: int,
+    width: int,
+    samples_per_axis: int = 2,
+    background: tuple[float, float, float] | Float[np.ndarray, "h w 3"] = (0.0, 0.0, 0.0),
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    """Draws a mesh with a color per vertex, antialiased by samples_per_axis² rays a pixel.
+
+    Args:
+      colors: linear radiance; below 0 counts as 0.
+      background: one color, or an image such as `environment_background` and `gradient_background` make.
+    Returns:
+      the linear image and the share of each pixel that the mesh covers.
+    """
+    surface = visible_surface(positions, faces, camera, height=height, width=width, samples_per_axis=samples_per_axis)
+    image, alpha = color_surface(surface, faces, colors)
+    behind = np.broadcast_to(np.asarray(background, np.float32), image.shape)
+    return lay_over(image, alpha, behind), alpha

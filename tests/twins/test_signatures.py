@@ -61,10 +61,16 @@ def public_names(package: str, module: str) -> dict[str, Any]:
         f"{module}.{name}": value
         for name, value in vars(loaded).items()
         if not name.startswith("_")
-        and (inspect.isfunction(value) or dataclasses.is_dataclass(value))
+        and (inspect.isfunction(value) or _is_record(value))
         and value.__module__ == loaded.__name__
         and f"{module}.{name}" not in EXCEPTIONS
     }
+
+
+def _is_record(value: Any) -> bool:
+    """A frozen dataclass of ours; solvers that plug into lineax or optimistix are machinery."""
+    machinery = [c for c in getattr(value, "__mro__", ()) if c.__module__.startswith(("lineax", "optimistix"))]
+    return inspect.isclass(value) and dataclasses.is_dataclass(value) and not machinery
 
 
 def pairs() -> list[str]:
