@@ -63,8 +63,8 @@ def sample_motion(character: Character, bake: BakeSettings, split: SplitSettings
             part[first_held:] = SEGMENT
         parts.append(part)
     own = np.repeat(np.arange(counts.sum())[:, None], len(character.skeleton.parents), axis=1)
-    labels = (np.concatenate(values) for values in (clips, times, parts))
-    motion = Motion(_concatenate(poses), *labels, clip_names=names, source=own)
+    of_clip, at, use = (np.concatenate(values) for values in (clips, times, parts))
+    motion = Motion(_concatenate(poses), of_clip, at, use, names, own)
     if motion.where(TRAIN).sum() < 2:
         got = f"{motion.where(TRAIN).sum()} of {len(motion)} (clips of one frame hold no motion)"
         bad_input(character.name, "training frames", expected="at least 2", got=got)

@@ -16,7 +16,7 @@ from fitting.motion import SEGMENT, Motion
 from fitting.shading import make_shader, open_sky, posed_mesh, traced_visibility, truth_colors
 from jaxrender.animation.skeleton import Pose, sample_clip
 from jaxrender.animation.skinning import Character, SkinnedMesh
-from jaxrender.camera import Camera, frame_bounds
+from jaxrender.camera import Camera, frame_bounds, look_at
 from jaxrender.checks import bad_input
 from jaxrender.harmonics.light import (
     environment_directions,
@@ -33,6 +33,7 @@ from jaxrender.io.picture import side_by_side, to_bytes, tone_map, write_animati
 from jaxrender.metrics import heatmap
 from jaxrender.pathtrace.preview import (
     VisibleSurface,
+    blur_environment,
     color_surface,
     environment_background,
     gradient_background,
@@ -140,27 +141,42 @@ def pose_at(poses: Pose, index: int) -> Pose:
     return jax.tree.map(lambda values: values[index], poses)
 
 
-def clip_bounds(character: Character, poses: Pose) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """The box around a character in up to 12 poses of a clip: all of its way, where it travels."""
+def clip_vertices(character: Character, poses: Pose) -> Float[np.ndarray, "n 3"]:
+    """The vertices of a character in up to 12 poses of a clip: all of its way, where it travels."""
     count = len(poses.rotation)
     some = sorted({round(i) for i in np.linspace(0, count - 1, min(count, 12))})
-    meshes = [np.asarray(posed_mesh(character, pose_at(poses, i)).positions) for i in some]
-    return np.min([m.min(axis=0) for m in meshes], axis=0), np.max([m.max(axis=0) for m in meshes], axis=0)
+    return np.concatenate([np.asarray(posed_mesh(character, pose_at(poses, i)).positions) for i in some])
 
 
-def frame_box(
-    low: Float[np.ndarray, "3"],
-    high: Float[np.ndarray, "3"],
+def frame_vertices(
+    vertices: Float[np.ndarray, "n 3"],
     *,
     azimuth_degrees: float,
     elevation_degrees: float,
     aspect: float,
+    margin: float = 0.12,
 ) -> Camera:
-    """A still camera that sees the whole of a box."""
-    return frame_bounds(
-        jnp.asarray(low), jnp.asarray(high), azimuth_radians=math.radians(azimuth_degrees),
-        elevation_radians=math.radians(elevation_degrees), aspect=aspect,
-    )  # fmt: skip
+    """A still camera that sees all vertices, with a margin, and is centred on them.
+
+    Closer than `frame_bounds`, which has to keep the corners of their box in view.
+    """
+    low, high = (jnp.asarray(x, jnp.float32) for x in (vertices.min(axis=0), vertices.max(axis=0)))
+    angles = {"azimuth_radians": math.radians(azimuth_degrees), "elevation_radians": math.radians(elevation_degrees)}
+    camera = frame_bounds(low, high, aspect=aspect, **angles)
+    axes = np.asarray(look_at(camera.eye, camera.target, camera.up), np.float64)
+    center = np.asarray(camera.target, np.float64)
+    slope = math.tan(0.5 * float(camera.fov_y_radians)) / (1.0 + margin)
+    distance = float(np.linalg.norm(np.asarray(camera.eye) - center))
+    for _ in range(8):
+        x, y, z = ((vertices - center) @ axes).T
+        distance = max(float(np.max(z + np.maximum(np.abs(x) / aspect, np.abs(y)) / slope)), 1e-6)
+        # On the picture plane through the center; what is off the middle on one side moves towards it.
+        across, along = x / (distance - z) * distance, y / (distance - z) * distance
+        center = center + axes[:, :2] @ [0.5 * (v.max() + v.min()) for v in (across, along)]
+    x, y, z = ((vertices - center) @ axes).T
+    distance = max(float(np.max(z + np.maximum(np.abs(x) / aspect, np.abs(y)) / slope)), 1e-6)
+    eye, target = (jnp.asarray(v, jnp.float32) for v in (center + distance * axes[:, 2], center))
+    return Camera(eye, target, camera.up, camera.fov_y_radians)
 
 
 # --- Stills
@@ -279,17 +295,15 @@ def make_still(
       num_directions: visibility rays a point, 0 for none.
     """
     mesh = posed_mesh(character, pose)
-    low, high = np.asarray(mesh.positions).min(axis=0), np.asarray(mesh.positions).max(axis=0)
-    x, y, z = high - low
+    vertices = np.asarray(mesh.positions)
+    x, y, z = np.ptp(vertices, axis=0)
     turn = math.radians(azimuth_degrees)
     across = abs(x * math.cos(turn)) + abs(z * math.sin(turn))
     aspect = float(np.clip(across / max(y, 1e-9), 0.55, 1.6))
-    camera = frame_box(
-        low, high, azimuth_degrees=azimuth_degrees, elevation_degrees=elevation_degrees, aspect=aspect
+    camera = frame_vertices(
+        vertices, azimuth_degrees=azimuth_degrees, elevation_degrees=elevation_degrees, aspect=aspect
     )  # fmt: skip
-    surface = visible_surface(
-        np.asarray(mesh.positions), np.asarray(character.faces), camera, height=size, width=round(size * aspect)
-    )
+    surface = visible_surface(vertices, np.asarray(character.faces), camera, height=size, width=round(size * aspect))
     traced = traced_visibility(character, mesh, num_directions=num_directions) if num_directions else ()
     return Still(character, model, pose, mesh, camera, surface, num_directions, traced)
 
@@ -377,10 +391,10 @@ def sweep_frames(
 
 
 def _film_camera(character: Character, poses: Pose, film: Film) -> Camera:
-    low, high = clip_bounds(character, poses)
     aspect = film.size[0] / film.size[1]
-    return frame_box(
-        low, high, azimuth_degrees=film.azimuth_degrees, elevation_degrees=film.elevation_degrees, aspect=aspect
+    return frame_vertices(
+        clip_vertices(character, poses), azimuth_degrees=film.azimuth_degrees,
+        elevation_degrees=film.elevation_degrees, aspect=aspect,
     )  # fmt: skip
 
 
@@ -389,7 +403,9 @@ class _Shots:
 
     def __init__(self, character: Character, model: PoseModel, environment, film: Film, camera: Camera):
         self.character, self.film, self.camera = character, film, camera
-        self.environment, self.light = environment, light_of(environment)
+        self.light = light_of(environment)
+        # Out of focus, as behind a portrait; it also hides the pixels of a small map.
+        self.environment = jnp.asarray(blur_environment(environment, degrees=0.7))
         self.shader = make_shader(character, model, material=film.material)
         self.faces = np.asarray(character.faces)
         wax = np.broadcast_to(np.array(WAX, np.float32), character.albedo.shape)

@@ -242,7 +242,8 @@ def choose_ridge(data: TrainingData, fit: FitSettings, *, max_points: int = 1200
     """The penalty whose linear SH model does best on motion left out of the training frames.
 
     Folds: the last fifth of every training clip, and each of up to four training clips left out whole. The score is
-    the mean of the logarithms of their errors, so that neither known nor unknown motion decides alone.
+    the logarithm of the first error plus the mean one of the others, so that neither known nor unknown motion decides
+    alone.
     """
     weights = data.frame_weights(fit.mixed_weight)
     points = _some_points(data, max_points)
@@ -269,7 +270,9 @@ def choose_ridge(data: TrainingData, fit: FitSettings, *, max_points: int = 1200
                 x = rotated / (np.maximum(values, 0) + ridge * np.trace(gram) / len(gram))[:, None]
                 scores[i, k] += np.sum((seen @ x - rest[left_out]) ** 2)
             totals[i] += np.sum(own[left_out] ** 2)
-    return RIDGES[int(np.argmin(np.log(scores / totals[:, None] + 1e-12).mean(axis=0)))]
+    logs = np.log(scores / totals[:, None] + 1e-12)
+    known, unknown = logs[0], logs[1:].mean(axis=0) if len(logs) > 1 else 0.0
+    return RIDGES[int(np.argmin(known + unknown))]
 
 
 def _folds(data: TrainingData) -> list[Bool[np.ndarray, " f"]]:

@@ -88,8 +88,8 @@ def phong_operator(exponent: Float[Array, "*b"], *, order: int = 4) -> Float[Arr
     """M^α[lm, l'm'] = ∫_{H²} cos^α θ y_lm y_l'm' ds, without the factor (α+1)/2π of `phong_normalization`.
 
     Exact for every real α >= 0 (and down to α > -1), smooth and differentiable in α. In float32 each entry
-    is within 1e-6 of its own magnitude up to order 10; nothing overflows, and entries below 1e-38 (high bands
-    at α of some 1e5) become 0.
+    is within 1e-6 of its own magnitude up to order 10; nothing overflows, and entries below 1e-36 (|m| >= 8 at α
+    of some 1e5) fade to 0.
 
     Args:
       exponent: α, any leading axes (one per vertex, say).

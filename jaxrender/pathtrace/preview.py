@@ -95,23 +95,20 @@ def gradient_background(
     return np.broadcast_to(blend, (height, width, 3)).copy()
 
 
+def blur_environment(environment: Float[np.ndarray, "h w c"], *, degrees: float) -> Float[np.ndarray, "h w c"]:
+    """A latitude-longitude map smoothed by a Gaussian of this standard deviation at its equator, closed around."""
+    sigma = degrees / 180.0 * environment.shape[0]
+    return gaussian_filter(environment, (sigma, sigma, 0.0), mode=("nearest", "wrap", "nearest"))
+
+
 def environment_background(
-    environment: Float[np.ndarray, "eh ew 3"],
-    camera: Camera,
-    *,
-    height: int,
-    width: int,
-    blur_degrees: float = 0.0,
+    environment: Float[np.ndarray, "eh ew 3"], camera: Camera, *, height: int, width: int
 ) -> Float[np.ndarray, "h w 3"]:
     """What the camera sees of a latitude-longitude map: bilinear in the map, which closes around.
 
     Args:
       environment: row 0 is +Y, the middle looks down -Z, columns turn towards +X.
-      blur_degrees: standard deviation of a Gaussian that the map is smoothed with first, at its equator.
     """
-    if blur_degrees > 0:
-        sigma = blur_degrees / 180.0 * environment.shape[0]
-        environment = gaussian_filter(environment, (sigma, sigma, 0.0), mode=("nearest", "wrap", "nearest"))
     _, directions = camera_rays(camera, height=height, width=width)
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
     eh, ew = environment.shape[:2]
