@@ -47,6 +47,7 @@ def fit_linear(
     if features.shape[0] != targets.shape[0]:
         raise ValueError(f"targets: expected {features.shape[0]} frames as in features, got {targets.shape[0]}")
     check_at_least("frames", features.shape[0], 1)
+    check_at_least("columns of features", features.shape[1], 1)
     mean_a, mean_b = jnp.mean(features, axis=0), jnp.mean(targets, axis=0)
     a, b = features - mean_a[None, :], targets - mean_b[None, :]
     frames, columns = a.shape

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxrender.checks import check_at_least
+from jaxrender.checks import bad_input, check_at_least, check_finite, check_last_axis
 from jaxrender.harmonics.sh import basis_columns
 from jaxrender.pathtrace.embree import RAYS_PER_TASK, EmbreeScene, pool
 from jaxrender.vecmath import matmul
@@ -56,7 +56,17 @@ def trace_visibility(
       relative_offset: origin's distance along the normal, as a share of the mesh's bounding diagonal.
     Returns:
       bits, big-endian within a byte as `numpy.packbits` makes them; bytes = ceil(d / 8).
+    Raises:
+      InputError: if a position or a frame is not finite, or a face names a vertex that is not there.
     """
+    check_last_axis("directions", directions, 3)
+    check_at_least("number of directions", len(directions), 1)
+    check_finite("mesh", "positions", positions)
+    check_finite("mesh", "frames", frames)
+    # Embree reads whatever an index points to.
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(positions):
+        got = f"{faces.min()}..{faces.max()}"
+        bad_input("mesh", "faces", expected=f"indices from 0 to {len(positions) - 1}", got=got)
     low, high = positions.min(axis=0), positions.max(axis=0)
     centred = (positions - 0.5 * (low + high)).astype(np.float32)
     scene = EmbreeScene(centred, faces)
