@@ -41,10 +41,11 @@ from benchmarks.timing import Timing, measure, measure_alternating, peak_memory
 from fitting.config import BakeSettings, FitSettings, SplitSettings, TrainSettings
 from fitting.dataset import PosedMesh, VisibilityStore, bake, character_frames, choose_points
 from fitting.features import all_raw_features, feature_groups, fit_basis, unfitted_basis
+from fitting.fit import predict_sh
 from fitting.model import to_half
 from fitting.motion import SEGMENT, TRAIN, sample_motion
 from fitting.solve import block_sh
-from fitting.train import predict_sh, train_character
+from fitting.train import train_character
 from jaxrender import console, harmonics
 from jaxrender.animation.mannequin import builtin_character
 from jaxrender.animation.skeleton import global_matrices

@@ -9,7 +9,8 @@ import numpy as np
 from safetensors.numpy import save
 
 from fitting.config import TrainSettings
-from fitting.train import ORDER, TrainResult
+from fitting.solve import ORDER
+from fitting.train import TrainResult
 from jaxrender.animation.skinning import Character
 from jaxrender.checks import bad_input
 from jaxrender.harmonics.pose_model import FORMAT, FORMAT_VERSION, PoseModel, load_pose_model, model_arrays

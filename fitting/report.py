@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from fitting.config import TrainSettings
-from fitting.evaluate import Evaluation, Study
+from fitting.evaluate import Evaluation
 from fitting.motion import PART_NAMES
+from fitting.study import Study
 from fitting.train import TrainResult
 from jaxrender import console
 from jaxrender.io.report import Report

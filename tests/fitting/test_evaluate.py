@@ -7,11 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting import evaluate as ev
+from fitting import errors
 from fitting.config import FitSettings
 from fitting.dataset import ShadingPoints
+from fitting.evaluate import evaluate
+from fitting.fit import fit_model, model_components, predict_sh
 from fitting.motion import MIXED, SEGMENT, TRAIN
-from fitting.train import TrainingData, fit_model, predict_sh
+from fitting.study import ground as ground_of
+from fitting.study import lobes, without_lobes
+from fitting.study.features import joint_distances
+from fitting.training_data import TrainingData
 from jaxrender.console import to_jsonable
 from jaxrender.harmonics.pose_model import FeatureBasis
 from jaxrender.harmonics.sh import sh_basis
@@ -79,17 +84,17 @@ def model(data):
 @pytest.fixture(scope="module")
 def full(data, model):
     angles = data.raw[:, :1] * np.float32(0.5), made_up_basis("exponential_map", 1)
-    return ev.evaluate(data, model, FIT, ridge=0.01, angles=angles, clip_names=("walk", "turn"))
+    return evaluate(data, model, FIT, ridge=0.01, angles=angles, clip_names=("walk", "turn"))
 
 
 @pytest.fixture(scope="module")
 def ground(data):
-    return ev.make_ground(ev.thin(data, np.flatnonzero(data.visible)), FIT, 0.01)
+    return ground_of.make_ground(ground_of.thin(data, np.flatnonzero(data.visible)), FIT, 0.01)
 
 
 def test_model_errors_are_those_of_its_predictions(data, model, full):
     points, real = np.flatnonzero(data.visible), data.part != MIXED
-    predicted = predict_sh(model, ev.model_components(model, data.raw[real]), points).astype(np.float64)
+    predicted = predict_sh(model, model_components(model, data.raw[real]), points).astype(np.float64)
     baked = data.sh(points)[real].astype(np.float64)
     error, truth = np.sum((predicted - baked) ** 2, axis=(1, 2)), np.sum(baked**2, axis=(1, 2))
     # Squares of float32 differences of O(0.1) numbers of O(1): relative error about 10 eps.
@@ -110,7 +115,7 @@ def test_what_is_not_there_is_none(data, model, full):
     assert all(row.sh["clips"] is None and row.environment["clips"] is None for row in full.study.rows)
     assert np.isnan(full.point_errors[4]) and np.isfinite(np.delete(full.point_errors, 4)).all()
     assert full.invisible_share == pytest.approx(1 / NUM_POINTS)
-    assert ev.evaluate(data, model, FIT, ridge=0.01, study=False).study is None
+    assert evaluate(data, model, FIT, ridge=0.01, study=False).study is None
 
 
 def test_everything_goes_into_strict_json(full):
@@ -122,7 +127,7 @@ def test_everything_goes_into_strict_json(full):
 def test_only_training_frames_left_paints_on_them(data, model):
     keep = data.part == TRAIN
     short = dataclasses.replace(data, bits=data.bits[keep], raw=data.raw[keep], part=PART[keep], clip=data.clip[keep])
-    found = ev.evaluate(short, model, FIT, ridge=0.01, study=False)
+    found = evaluate(short, model, FIT, ridge=0.01, study=False)
     assert found.errors["segments"] is None and found.painted_on == "training frames"
     assert {row["clip"] for row in found.clips} == {"clip 0", "clip 1"}
 
@@ -138,8 +143,8 @@ def test_bands_make_up_the_whole(full, data):
 def test_error_sums_add_up_over_points():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 5, 6, 16)).astype(np.float32)
-    both = ev.sum_errors(a[:, :2], b[:, :2]) + ev.sum_errors(a[:, 2:], b[:, 2:])
-    np.testing.assert_allclose(both.frame_curve()["std"], ev.sum_errors(a, b).frame_curve()["std"], rtol=1e-5)
+    both = errors.sum_errors(a[:, :2], b[:, :2]) + errors.sum_errors(a[:, 2:], b[:, 2:])
+    np.testing.assert_allclose(both.frame_curve()["std"], errors.sum_errors(a, b).frame_curve()["std"], rtol=1e-5)
     assert both.num_points == 6
 
 
@@ -172,7 +177,7 @@ def test_study_figures_and_goals_fit_the_table(full):
 def test_without_penalty_the_linear_model_interpolates(data):
     rng = np.random.default_rng(1)
     rich = dataclasses.replace(data, raw=rng.normal(size=(len(PART), 2, 60)).astype(np.float32))
-    linear = ev.linear_pose(rich, dataclasses.replace(FIT, num_components=60), 0.0)
+    linear = ground_of.linear_pose(rich, dataclasses.replace(FIT, num_components=60), 0.0)
     targets = rng.normal(size=(len(PART), NUM_POINTS, 3))
     # Axes in float32 leave the components orthogonal to about 1e-7, times the 34 components' spread in size.
     used = linear.weights > 0
@@ -182,15 +187,15 @@ def test_without_penalty_the_linear_model_interpolates(data):
 def test_principal_components_lose_nothing_when_all_are_kept(ground):
     linear = ground.linear.predict(ground.sh)
     # Orthonormal float32 axes: tens of roundings of numbers up to 2.5.
-    np.testing.assert_allclose(ev.point_pca(ground, 16), linear, atol=2e-5)
-    np.testing.assert_allclose(ev.global_pca(ground, ground.sh, 16), linear, atol=2e-5)
-    assert np.abs(ev.point_pca(ground, 2) - linear).max() > 1e-2
+    np.testing.assert_allclose(without_lobes.point_pca(ground, 16), linear, atol=2e-5)
+    np.testing.assert_allclose(without_lobes.global_pca(ground, ground.sh, 16), linear, atol=2e-5)
+    assert np.abs(without_lobes.point_pca(ground, 2) - linear).max() > 1e-2
 
 
 def test_shading_truth_is_the_sum_over_the_bits(data, ground):
     directions = hemisphere_directions(NUM_DIRECTIONS)
     free = np.unpackbits(data.bits[5, 0], count=NUM_DIRECTIONS).astype(np.float64)
-    for lights in ev.light_sets().values():
+    for lights in ground_of.light_sets().values():
         radiance = np.asarray(sh_basis(jnp.asarray(directions, jnp.float32), order=4)) @ lights.T
         shade = (free * directions[:, 2] / np.pi) @ radiance * (2 * np.pi / NUM_DIRECTIONS)
         # 64 float32 terms of the size of the light.
@@ -199,8 +204,8 @@ def test_shading_truth_is_the_sum_over_the_bits(data, ground):
 
 def test_perfect_transfer_has_no_shading_error_and_none_has_all(ground):
     part = ground.data.part
-    assert ev.shading_errors(ground.cosine, ground.cosine, part)["directional"]["train"] == 0.0
-    black = ev.shading_errors(np.zeros_like(ground.cosine), ground.cosine, part)
+    assert ground_of.shading_errors(ground.cosine, ground.cosine, part)["directional"]["train"] == 0.0
+    black = ground_of.shading_errors(np.zeros_like(ground.cosine), ground.cosine, part)
     assert black["environment"]["segments"] == pytest.approx(1.0) and black["directional"]["clips"] is None
 
 
@@ -210,9 +215,9 @@ def test_fit_rows_finds_lobes_near_the_start():
     numbers = np.concatenate([rng.uniform(-0.2, 0.2, (20, 4)), rng.uniform(0.5, 1.5, (20, 8))], axis=1).astype(
         np.float32
     )
-    sh = np.asarray(ev._from_charts(numbers[None], axes))[0]
-    found = ev.fit_rows(sh, axes, penalty=np.full(12, 1e-8, np.float32), num_steps=20)
-    again = np.asarray(ev._from_charts(found[None], axes))[0]
+    sh = np.asarray(lobes._from_charts(numbers[None], axes))[0]
+    found = lobes.fit_rows(sh, axes, penalty=np.full(12, 1e-8, np.float32), num_steps=20)
+    again = np.asarray(lobes._from_charts(found[None], axes))[0]
     # An exact fit exists; Levenberg-Marquardt in float32 ends where squared errors stop falling, near sqrt(eps).
     np.testing.assert_allclose(again, sh, atol=1e-3)
 
@@ -221,21 +226,21 @@ def test_angles_and_charts_name_the_same_lobes():
     rng = np.random.default_rng(6)
     axes = np.tile(np.eye(3, dtype=np.float32)[[2, 0]], (7, 1, 1))
     numbers = rng.uniform(-0.5, 0.5, (7, 12)).astype(np.float32)
-    from_angles = ev._from_angles(ev._angles_from_charts(numbers, axes))
+    from_angles = lobes._from_angles(lobes._angles_from_charts(numbers, axes))
     # Angles near the pole are good to sqrt(eps) in float32, and axes turn by as much.
-    np.testing.assert_allclose(from_angles, ev._from_charts(numbers[None], axes)[0], atol=2e-3)
+    np.testing.assert_allclose(from_angles, lobes._from_charts(numbers[None], axes)[0], atol=2e-3)
 
 
 def test_joint_distances_undo_the_falloff():
     basis = made_up_basis("surroundings", 2)
-    found = ev.joint_distances(basis, np.array([1, 3, 99]))
+    found = joint_distances(basis, np.array([1, 3, 99]))
     # A float32 exponential and its logarithm.
     np.testing.assert_allclose(found[:, :2], np.linspace(0, 1, 8).reshape(2, 4)[:, [1, 3]], atol=1e-5)
     np.testing.assert_allclose(found[:, 2], np.linspace(0, 1, 8).reshape(2, 4).mean(axis=1), atol=1e-5)
 
 
 def test_kernel_reference_follows_the_training_frames(ground):
-    predicted = ev.KernelPose(ground.data, ground.linear.weights).predict(ground.sh)
+    predicted = without_lobes.KernelPose(ground.data, ground.linear.weights).predict(ground.sh)
     linear = ground.linear.predict(ground.sh)
     train = ground.train
     assert np.sum((predicted - ground.sh)[train] ** 2) < np.sum((linear - ground.sh)[train] ** 2)

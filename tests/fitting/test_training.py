@@ -16,9 +16,11 @@ from fitting.cli import main
 from fitting.config import BakeSettings, FitSettings, SplitSettings, TrainSettings
 from fitting.dataset import VisibilityStore, choose_points
 from fitting.features import all_raw_features, unfitted_basis
+from fitting.fit import predict_sh
 from fitting.model import MODEL_FILE, find_model, save_pose_model, to_half
 from fitting.motion import CLIP, MIXED, SEGMENT, TRAIN, articulating_joints, limb_starts, sample_motion
-from fitting.train import bake_character, predict_sh, train_character, train_sequence
+from fitting.train import train_character, train_sequence
+from fitting.training_data import bake_character
 from jaxrender.animation.mannequin import builtin_character
 from jaxrender.animation.skeleton import Clip
 from jaxrender.checks import InputError
