@@ -44,7 +44,7 @@ class Train:
     split: SplitSettings = field(default_factory=SplitSettings)
     fit: FitSettings = field(default_factory=FitSettings)
     study: bool = True
-    """Compare with the paper's methods and the baselines on a sample of points; takes a minute or two."""
+    """Whether to compare with the paper's methods and the baselines, on a sample of points: a minute or two."""
     json: bool = False
     """Print one JSON object instead of the list of files."""
 
@@ -65,7 +65,7 @@ class Evaluate:
     model: tyro.conf.Positional[Path]
     """The folder of a training run."""
     study: bool = True
-    """Compare with the paper's methods and the baselines on a sample of points."""
+    """Whether to compare with the paper's methods and the baselines, on a sample of points."""
     json: bool = False
     """Print one JSON object instead of the list of files."""
 
