@@ -319,7 +319,7 @@ def _train(sizes: Sizes, refine_steps: int, num_mixed: int, seed: int) -> tuple[
         "num_mixed": num_mixed,
         "num_directions": sizes.directions,
         "num_lobes": NUM_LOBES,
-        "num_components": result.model.weights.shape[1] - 1,
+        "num_components": len(result.model.weights) - 1,
         "refine_steps": refine_steps,
     }
     return metrics, params | _xla_params()
@@ -369,7 +369,8 @@ class _Shading:
 
     def part(self, span: slice) -> "_Shading":
         """The same for some of the points."""
-        own = {name: getattr(self.model, name)[span] for name in ("weights", "axes", "offset", "groups")}
+        own = {name: getattr(self.model, name)[span] for name in ("axes", "offset", "groups")}
+        own["weights"] = self.model.weights[..., span]
         rest = {name: getattr(self, name)[span] for name in ("frames", "positions", "albedo", "exponent")}
         return dataclasses.replace(self, model=dataclasses.replace(self.model, **own), **rest)
 
@@ -384,9 +385,9 @@ def _synthetic_model(body: Character, sizes: Sizes, seed: int):
     raw = all_raw_features(basis, body, motion)
     basis, _ = fit_basis(basis, raw, np.ones(len(motion)), sizes.num_components)
     rng, p = np.random.default_rng(seed), len(points.vertices)
-    weights = 0.05 * rng.standard_normal((p, basis.basis.shape[-1] + 1, 6 * NUM_LOBES), np.float32)
-    weights[:, 0, 2 * NUM_LOBES :: 4] += 0.8
-    weights[:, 0, 2 * NUM_LOBES + 1 :: 4] += 0.7
+    weights = 0.05 * rng.standard_normal((basis.basis.shape[-1] + 1, 6 * NUM_LOBES, p), np.float32)
+    weights[0, 2 * NUM_LOBES :: 4] += 0.8
+    weights[0, 2 * NUM_LOBES + 1 :: 4] += 0.7
     axes = rng.standard_normal((p, NUM_LOBES, 3), np.float32) + np.array([0, 0, 2], np.float32)
     model = PoseModel(
         features=basis,

@@ -72,7 +72,7 @@ def fit_model(data: TrainingData, fit: FitSettings, *, ridge: float, track: Trac
     weights = data.frame_weights(fit.mixed_weight)
     basis, moments = fit_basis(data.basis, data.raw, weights, fit.num_components)
     used, k, p = weights > 0, moments.shape[1], len(data.points.vertices)
-    numbers = np.zeros((p, k + 1, 6 * fit.num_lobes), np.float16 if fit.half_precision else np.float32)
+    numbers = np.zeros((k + 1, 6 * fit.num_lobes, p), np.float16 if fit.half_precision else np.float32)
     axes = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (p, fit.num_lobes, 1))
     offset = np.zeros((p, ORDER**2), np.float32)
     todo = blocks(data.groups, np.flatnonzero(data.visible))
@@ -89,7 +89,7 @@ def fit_model(data: TrainingData, fit: FitSettings, *, ridge: float, track: Trac
         solutions = itertools.chain([first], threads.map(solve, todo[1:]))
         for block in track(iter(todo), len(todo), "fit"):
             solved, n = next(solutions), len(block.points)
-            numbers[block.points] = np.swapaxes(solved[0], 0, 1)[:n]
+            numbers[..., block.points] = np.swapaxes(solved[0], 1, 2)[..., :n]
             axes[block.points], offset[block.points] = solved[1][:n], solved[2][:n]
     return PoseModel(
         features=basis,
@@ -182,7 +182,7 @@ def predict_sh(
     weights, axes, offset = (np.asarray(x) for x in (model.weights, model.axes, model.offset))
     for block in blocks(np.asarray(model.groups), points):
         own = block.padded
-        numbers = np.swapaxes(weights[own].astype(np.float32), 0, 1)
+        numbers = np.swapaxes(weights[..., own], 1, 2).astype(np.float32)
         sh = predict_block(components[:, block.group], numbers, axes[own], offset[own])
         result[:, where[block.points]] = np.asarray(sh)[:, : len(block.points)]
     return result

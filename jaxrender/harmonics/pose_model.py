@@ -60,7 +60,7 @@ class PoseModel:
     """Everything needed to predict visibility; a pytree of arrays.
 
     Attributes:
-      weights: (p, k+1, 6c); row 0 is the bias, then one row per component. Of the 6c columns the first 2c are
+      weights: (k+1, 6c, p); row 0 is the bias, then one row per component. Of the 6c columns the first 2c are
         chart coordinates, lobe by lobe, then four coefficients per lobe.
       axes: the reference axis of each lobe's chart, in the vertex frame.
       offset: constant SH visibility added to the lobes.
@@ -69,7 +69,7 @@ class PoseModel:
     """
 
     features: FeatureBasis
-    weights: Float[Array, "p m d"]
+    weights: Float[Array, "m d p"]
     axes: Float[Array, "p c 3"]
     offset: Float[Array, "p 16"]
     groups: Int[Array, " p"]
@@ -181,10 +181,17 @@ def project_features(basis: FeatureBasis, raw: Float[Array, "*b g n"]) -> Float[
 
 def predict_numbers(model: PoseModel, components: Float[Array, "g k"]) -> Float[Array, "p d"]:
     """The 6c numbers of each point for one pose: bias + components · weights."""
-    own = components[model.groups]
-    # Weights may be stored as float16; the sum is made in the components' precision.
-    weights = model.weights.astype(own.dtype)
-    return weights[:, 0] + jnp.sum(own[:, :, None] * weights[:, 1:], axis=1)
+    own = components.T[:, model.groups]
+    rows = jnp.concatenate([jnp.ones_like(own[:1]), own])
+
+    def add(numbers, row):
+        # Weights may be stored as float16; the sum is made in the components' precision.
+        factor, weights = row
+        return numbers + factor[None] * weights.astype(own.dtype), None
+
+    # All points of a row are one run of memory: 1.0 ms for 10k points, 8.1 ms with the points in front.
+    start = jnp.zeros(model.weights.shape[1:], own.dtype)
+    return jax.lax.scan(add, start, (rows, model.weights))[0].T
 
 
 def lobes_from_numbers(
@@ -277,7 +284,7 @@ def _check_types(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _check_shapes(path: Path, arrays: dict[str, np.ndarray], kind: str) -> None:
-    (p, m, _), c = arrays["weights"].shape, arrays["axes"].shape[1]
+    m, (p, c, _) = len(arrays["weights"]), arrays["axes"].shape
     (g, n), i = arrays["features.mean"].shape, len(arrays["features.joints"])
     if m < 1 or c < 1:
         bad_input(path, "weights", expected="a bias row and at least one lobe", got=f"{m} rows, {c} lobes")
@@ -285,7 +292,7 @@ def _check_shapes(path: Path, arrays: dict[str, np.ndarray], kind: str) -> None:
         bad_input(path, "features.mean", expected=f"one group for {kind}", got=f"{g} groups")
     n = _PER_JOINT[kind] * i if kind in _PER_JOINT else n
     shapes = {
-        "weights": (p, m, 6 * c), "axes": (p, c, 3), "offset": (p, 16), "groups": (p,), "visible": (p,),
+        "weights": (m, 6 * c, p), "axes": (p, c, 3), "offset": (p, 16), "groups": (p,), "visible": (p,),
         "features.bones": (g,), "features.falloff": (g, i), "features.reference": (i, 4),
         "features.translations": (i, 3), "features.mean": (g, n), "features.basis": (g, n, m - 1),
     }  # fmt: skip
@@ -295,7 +302,7 @@ def _check_shapes(path: Path, arrays: dict[str, np.ndarray], kind: str) -> None:
 
 
 def _check_values(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    limits = {"groups": len(arrays["features.mean"]), "points": len(arrays["weights"])}
+    limits = {"groups": len(arrays["features.mean"]), "points": len(arrays["axes"])}
     for name, array in arrays.items():
         if name in _INDICES:
             limit = limits.get(name, 2**31)

@@ -67,8 +67,8 @@ def body():
 def model(body):
     """Unoccluded, whatever the pose: exact for a ball."""
     p = len(body.albedo)
-    weights = np.zeros((p, 2, 6), np.float32)
-    weights[:, 0, 2:] = hemisphere_zh(order=4)
+    weights = np.zeros((2, 6, p), np.float32)
+    weights[0, 2:] = np.asarray(hemisphere_zh(order=4))[:, None]
     basis = FeatureBasis(
         kind="surroundings",
         size=2.0,

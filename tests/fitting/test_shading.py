@@ -65,8 +65,8 @@ def model_of(character, rng, *, num_points=None, wobble=0.0):
     v = len(character.albedo)
     points = np.arange(v) if num_points is None else np.arange(v) % num_points
     p = points.max() + 1
-    weights = wobble * rng.normal(size=(p, 2, 12))
-    weights[:, 0, 4:8] += np.asarray(hemisphere_zh(order=4))
+    weights = wobble * rng.normal(size=(2, 12, p))
+    weights[0, 4:8] += np.asarray(hemisphere_zh(order=4))[:, None]
     axes = np.tile([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]], (p, 1, 1))
     basis = FeatureBasis(
         kind="surroundings",

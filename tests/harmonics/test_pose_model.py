@@ -166,7 +166,7 @@ def arrays(seed=0, kind="surroundings"):
         return rng.normal(size=shape).astype(np.float32)
 
     return {
-        "weights": normal(NUM_POINTS, NUM_COMPONENTS + 1, 6 * NUM_LOBES),
+        "weights": normal(NUM_COMPONENTS + 1, 6 * NUM_LOBES, NUM_POINTS),
         "axes": unit(normal(NUM_POINTS, NUM_LOBES, 3)),
         "offset": normal(NUM_POINTS, 16),
         "groups": rng.integers(0, groups, NUM_POINTS).astype(np.int32),
@@ -209,7 +209,7 @@ def test_prediction_by_loops(model, rng):
     assert coefficients.shape == (NUM_POINTS, NUM_LOBES, 4)
     a = arrays()
     for p in range(NUM_POINTS):
-        w = a["weights"][p].astype(np.float64)
+        w = a["weights"][..., p].astype(np.float64)
         numbers = w[0] + components[a["groups"][p]] @ w[1:]
         for lobe in range(NUM_LOBES):
             q, c = numbers[2 * lobe : 2 * lobe + 2] / 2, numbers[2 * NUM_LOBES + 4 * lobe :][:4]
@@ -365,7 +365,8 @@ def test_missing_tensors_and_shapes(name, tmp_path):
 
 # One row too many; where the array defines a size, the one that has to follow it is named.
 NAMED_FOR = {
-    "weights": "axes",
+    "weights": "features.basis",
+    "axes": "weights",
     "groups": "groups",
     "features.joints": "features.falloff",
     "features.mean": "features.bones",
@@ -442,9 +443,9 @@ def test_shapes_must_fit_together(tmp_path):
     def changed(**change):
         return write(tmp_path / "m", tensors | {k.replace("__", "."): v for k, v in change.items()}, header())
 
-    refused(changed(axes=tensors["axes"][:, :1]), "weights", "shape (6, 5, 6)")
+    refused(changed(axes=tensors["axes"][:, :1]), "weights", "shape (5, 6, 6)")
     refused(changed(axes=tensors["axes"][:, :0]), "weights", "at least one lobe")
-    refused(changed(weights=tensors["weights"][:, :0]), "weights", "a bias row")
+    refused(changed(weights=tensors["weights"][:0]), "weights", "a bias row")
     refused(changed(offset=tensors["offset"][:, :9]), "offset", "shape (6, 16), got shape (6, 9)")
     refused(changed(features__mean=tensors["features.mean"][:, :38]), "features.mean", "shape (2, 39)")
     refused(changed(features__basis=tensors["features.basis"][..., :3]), "features.basis", "shape (2, 39, 4)")

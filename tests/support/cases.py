@@ -658,7 +658,7 @@ def _pose_model_record() -> Record:
     }
     model = {
         "features": Record("harmonics.pose_model.FeatureBasis", basis),
-        "weights": 0.3 * _normal(p, k + 1, 6 * c),
+        "weights": 0.3 * _normal(k + 1, 6 * c, p),
         "axes": _unit(p, c),
         "offset": _normal(p, 16),
         "groups": np.array([0, 1, 1, 0, 0, 1], dtype=np.int32),

@@ -49,7 +49,7 @@ class PoseModel:
     """
 
     features: FeatureBasis
-    weights: Float[Tensor, "p m d"]
+    weights: Float[Tensor, "m d p"]
     axes: Float[Tensor, "p c 3"]
     offset: Float[Tensor, "p 16"]
     groups: Int[Tensor, " p"]
@@ -137,7 +137,8 @@ def project_features(basis: FeatureBasis, raw: Float[Tensor, "*b g n"]) -> Float
 @in_float64
 def predict_numbers(model: PoseModel, components: Float[Tensor, "g k"]) -> Float[Tensor, "p d"]:
     """The 6c numbers of each point: bias + components of its group · weights."""
-    rows = [w[0] + components[group] @ w[1:] for w, group in zip(model.weights, model.groups.tolist(), strict=True)]
+    each = zip(model.weights.unbind(-1), model.groups.tolist(), strict=True)
+    rows = [w[0] + components[group] @ w[1:] for w, group in each]
     return torch.stack(rows)
 
 
