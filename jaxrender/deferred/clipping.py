@@ -110,7 +110,8 @@ def _fan(corners: Float[Array, "3 4"], *, height: int, width: int):
     start = jnp.concatenate([corners, jnp.eye(3, dtype=corners.dtype)], axis=1)
     polygon = jnp.zeros((_CORNERS, 7), corners.dtype).at[:3].set(start)
     planes = jnp.asarray(_planes(height=height, width=width), corners.dtype)
-    (polygon, count), _ = jax.lax.scan(lambda state, plane: (_cut(*state, plane), None), (polygon, 3), planes)
+    step = lambda state, plane: (_cut(state[0], state[1], plane), None)  # noqa: E731
+    (polygon, count), _ = jax.lax.scan(step, (polygon, jnp.int32(3)), planes)
     fan = np.stack([np.zeros(FAN, int), np.arange(1, FAN + 1), np.arange(2, FAN + 2)], axis=1)
     return polygon[fan], jnp.arange(FAN) < count - 2
 

@@ -39,14 +39,19 @@ def test_soups(rng, cull):
 
 
 def test_slivers(rng):
-    """Needles a few sub-pixels wide, all at one depth: the first covers."""
-    a = rng.uniform(-1.2, 1.2, (300, 1, 2))
-    along = rng.normal(size=(300, 1, 2))
+    """Needles a few sub-pixels wide, all at one depth: the same samples, and the same triangle where there is one."""
+    # Inside the picture: what leaves it they cut at its border, and snap again.
+    a = rng.uniform(-0.9, 0.9, (300, 1, 2))
+    along = rng.uniform(-0.95, 0.95, (300, 1, 2)) - a
     points = np.concatenate([a, a + along, a + along * 0.5 + rng.normal(size=(300, 1, 2)) * 0.004], axis=1)
     clip = np.concatenate([points.reshape(-1, 2), np.full((900, 1), 0.5), np.ones((900, 1))], 1).astype(np.float32)
     ours, (ids, _, _) = both(clip, np.arange(900).reshape(-1, 3), height=96, width=96)
     assert (ids >= 0).mean() > 0.05
-    assert (np.asarray(ours.triangle_id)[..., 0] == ids).all()
+    mine = np.asarray(ours.triangle_id)[..., 0]
+    exact, _, layers = brute_force(clip, np.arange(900).reshape(-1, 3), height=96, width=96, positions_px=CENTER)
+    assert ((mine >= 0) == (ids >= 0)).all()
+    assert (mine == ids)[layers[..., 0] == 1].all()
+    assert (mine == exact[..., 0]).all()
 
 
 def test_triangles_cut_by_the_near_plane(rng):
@@ -61,19 +66,21 @@ def test_triangles_cut_by_the_near_plane(rng):
 
 def test_interpolation_modes(rng):
     """Smooth, noperspective and flat (OpenGL's last vertex) on overlapping triangles with uneven w."""
-    clip, faces = soup(rng, 60, size=0.9)
+    clip, faces = soup(rng, 60, spread=0.5, size=0.3)
+    # Inside the picture: noperspective values of what they cut at its border are not numbers.
+    clip[:, :2] = np.clip(clip[:, :2], -0.98 * clip[:, 3:], 0.98 * clip[:, 3:])
     values = rng.normal(size=(len(clip), 4)).astype(np.float32)
     ours, (ids, _, pictures) = both(clip, faces, height=96, width=96, values=values)
     same = np.asarray(ours.triangle_id)[..., 0] == ids
     area = np.asarray(ours.triangles.area)[np.maximum(ids, 0)]
     # On triangles under a pixel their planes are steep beyond float32.
     large = same & (ids >= 0) & (area > 256 * 256)
-    assert large.sum() > 3000
+    assert large.sum() > 2000
     for mode, picture in zip(("perspective", "noperspective", "flat_last"), pictures, strict=True):
         mine = np.asarray(interpolate(ours, jnp.asarray(values), mode=mode))[..., 0, :]
         error = np.abs(mine[large] - picture[large])
         # Their plane is a float32 one from the corner of the image; ours is judged in test_interpolate.
-        assert np.median(error) < 2e-5
+        assert np.median(error) < 1e-4
         assert np.quantile(error, 0.999) < 5e-3
         assert error.max() < 0.05
 

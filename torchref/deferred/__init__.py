@@ -1,0 +1,1 @@
+"""The deferred room in torch: every triangle against every sample, one after another."""
