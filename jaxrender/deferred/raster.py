@@ -33,11 +33,10 @@ from jaxrender.deferred.triangles import (
     SUBPIXELS,
     ScreenTriangles,
     edges,
-    perspective_weights,
     project_triangles,
-    screen_barycentrics,
 )
 from jaxrender.machine import num_cores
+from jaxrender.vecmath import safe_div
 
 
 @jax.tree_util.register_dataclass
@@ -115,9 +114,9 @@ def rasterize_within(
     runs = spans(triangles, grid, pattern, first_row=first_row, num_rows=num_rows, max_spans=budget.max_spans)
     tile, triangle = pairs(runs, max_pairs=budget.max_pairs, num_tiles=grid.count)
     lists = sort_pairs(tile, triangle, num_tiles=grid.count)
-    order = _tiles_by_work(lists.count, tiles_per_chunk)
-    tiles = fill_tiles(triangles, lists, order, grid, pattern)
-    fragments = _assemble(faces, triangles, order, tiles, grid, samples)
+    plan = _plan(grid, pattern, tiles_per_chunk)
+    cells = fill_strips(triangles, lists, jnp.arange(plan.num_strips), plan)
+    fragments = _assemble(faces, triangles, cells, plan, samples)
     return fragments, Demand(num_clipped, jnp.sum(num_rows), jnp.sum(runs.count))
 
 
@@ -137,30 +136,74 @@ def _tile_size(num_offsets: int) -> int:
     return 16 if num_offsets == 1 else 8 if num_offsets <= 4 else 4
 
 
-def _tiles_by_work(count: Int[Array, " tiles"], tiles_per_chunk: int) -> Int[Array, "chunks n"]:
-    """Tiles with the longest lists first, in chunks; filled up with tile -1."""
-    padding = -len(count) % tiles_per_chunk
-    order = jnp.argsort(-count, stable=True).astype(jnp.int32)
-    return jnp.concatenate([order, jnp.full(padding, -1, jnp.int32)]).reshape(-1, tiles_per_chunk)
+@dataclass(frozen=True)
+class _Plan:
+    """How the image is cut: strips of rows of tiles, in which chunks of tiles are worked on in lockstep.
+
+    A strip is small enough for a processor's cache, and holds enough tiles to sort them by the length of their lists.
+    """
+
+    grid: TileGrid
+    pattern: Samples
+    rows_per_strip: int
+    tiles_per_chunk: int
+
+    @property
+    def num_strips(self) -> int:
+        return -(-self.grid.rows // self.rows_per_strip)
+
+    @property
+    def tiles_per_strip(self) -> int:
+        return self.rows_per_strip * self.grid.columns
+
+
+def _plan(grid: TileGrid, pattern: Samples, tiles_per_chunk: int, *, tiles_per_strip: int = 2048) -> _Plan:
+    return _Plan(grid, pattern, max(1, tiles_per_strip // max(grid.columns, 1)), tiles_per_chunk)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class TileSamples:
-    """The fields of `Fragments` by tile; lanes run over rows, columns and samples of the tile's pixels."""
+class Cells:
+    """The fields of `Fragments` over the cells of an image: rows, columns, samples of the pattern."""
 
-    screen_id: Int[Array, "chunks n lanes"]
-    barycentrics: Float[Array, "chunks n lanes 2"]
-    depth: Float[Array, "chunks n lanes"]
-    w: Float[Array, "chunks n lanes"]
+    triangle_id: Int[Array, "*b s"]
+    screen_id: Int[Array, "*b s"]
+    barycentrics: Float[Array, "*b s 2"]
+    depth: Float[Array, "*b s"]
+    w: Float[Array, "*b s"]
 
 
-def fill_tiles(
-    triangles: ScreenTriangles, lists: TileLists, order: Int[Array, "chunks n"], grid: TileGrid, pattern: Samples
-) -> TileSamples:
-    """Runs the depth test of all tiles named in `order`, chunk by chunk."""
-    lanes = _Lanes.of(grid, pattern)
-    return jax.lax.map(lambda tile: _fill_chunk(triangles, lists, tile, grid, lanes), order)
+def fill_strips(triangles: ScreenTriangles, lists: TileLists, strips: Int[Array, " k"], plan: _Plan) -> Cells:
+    """Runs the depth test over some strips of the image; cells (k, rows, columns, s)."""
+    lanes, planes = _Lanes.of(plan.grid, plan.pattern), _planes(triangles)
+    return jax.lax.map(lambda strip: _fill_strip(triangles, planes, lists, strip, plan, lanes), strips)
+
+
+def _fill_strip(triangles, planes, lists: TileLists, strip: Int[Array, ""], plan: _Plan, lanes: "_Lanes") -> Cells:
+    """One strip: its tiles in order of their work, chunk by chunk, and back in their places."""
+    n, chunk = plan.tiles_per_strip, plan.tiles_per_chunk
+    tile = strip * n + jnp.arange(n, dtype=jnp.int32)
+    tile = jnp.where(tile < plan.grid.count, tile, -1)
+    order = jnp.argsort(-jnp.where(tile >= 0, lists.count[tile], 0), stable=True)
+    chunks = jnp.concatenate([tile[order], jnp.full(-n % chunk, -1, jnp.int32)]).reshape(-1, chunk)
+    filled = jax.lax.map(lambda own: _fill_chunk(triangles, planes, lists, own, plan.grid, lanes), chunks)
+    place = jnp.zeros(n, jnp.int32).at[order].set(jnp.arange(n, dtype=jnp.int32))
+    size, s = plan.grid.size, len(plan.pattern.offsets)
+
+    def put(values: Array) -> Array:
+        rest = values.shape[3:]
+        tiles = values.reshape(-1, *values.shape[2:])[place]
+        rows = tiles.reshape(plan.rows_per_strip, plan.grid.columns, size, size, s, *rest).swapaxes(1, 2)
+        return rows.reshape(plan.rows_per_strip * size, plan.grid.columns * size, s, *rest)
+
+    return jax.tree.map(put, filled)
+
+
+def _planes(triangles: ScreenTriangles) -> Float[Array, "n 3 4"]:
+    """What is linear on the screen, at the corners: window depth, 1/w, and b_1/w and b_2/w of the source triangle."""
+    over_w = safe_div(jnp.ones_like(triangles.w), triangles.w)
+    weights = triangles.weights[..., 1:] * over_w[..., None]
+    return jnp.concatenate([triangles.z[..., None], over_w[..., None], weights], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -184,89 +227,76 @@ class _Lanes:
         return cls(0, SUBPIXELS // 16, x.astype(np.int32), y.astype(np.int32))
 
 
-def _fill_chunk(
-    triangles: ScreenTriangles, lists: TileLists, tile: Int[Array, " n"], grid: TileGrid, lanes: _Lanes
-) -> TileSamples:
-    """The triangles of each tile's list, one after another, for n tiles side by side."""
+def _fill_chunk(triangles, planes, lists: TileLists, tile: Int[Array, " n"], grid: TileGrid, lanes: _Lanes) -> Cells:
+    """The triangles of each tile's list, one after another, for n tiles side by side; cells (n, lanes)."""
     x, y = (corner + lanes.base for corner in grid.corner(tile))
     start, count = lists.start[tile], jnp.where(tile >= 0, lists.count[tile], 0)
-    shape = (len(tile), len(lanes.x))
+    zero = jnp.zeros((len(tile), len(lanes.x)), jnp.float32)
 
     def step(state):
-        turn, depth, winner = state
+        turn, winner, depth, held = state
         active = turn < count
         triangle = lists.triangles[jnp.where(active, start + turn, 0)]
-        inside, z = _cover(triangles, triangle, x, y, lanes)
+        inside, z, values = _cover(triangles, planes, triangle, x, y, lanes)
         # The far plane belongs to the picture; lists are in drawing order, so that the first one keeps a tie.
         wins = inside & active[:, None] & (z >= 0.0) & (z <= 1.0) & (z < depth)
-        return turn + 1, jnp.where(wins, z, depth), jnp.where(wins, triangle[:, None], winner)
+        held = [jnp.where(wins, new, old) for new, old in zip(values, held, strict=True)]
+        return turn + 1, jnp.where(wins, triangle[:, None], winner), jnp.where(wins, z, depth), held
 
-    empty = jnp.int32(0), jnp.full(shape, 2.0, jnp.float32), jnp.full(shape, -1, jnp.int32)
-    _, depth, winner = jax.lax.while_loop(lambda state: state[0] < jnp.max(count), step, empty)
-    return _finish(triangles, winner, depth, x, y, lanes)
+    empty = jnp.int32(0), jnp.full(zero.shape, -1, jnp.int32), zero + 2.0, [zero + 1.0, zero, zero]
+    _, winner, depth, (over_w, b1, b2) = jax.lax.while_loop(lambda state: state[0] < jnp.max(count), step, empty)
+    covered = winner >= 0
+    barycentrics = jnp.clip(jnp.stack([b1, b2], axis=-1) / over_w[..., None], 0.0, 1.0)
+    return Cells(
+        triangle_id=jnp.where(covered, triangles.source[winner], -1),
+        screen_id=winner,
+        barycentrics=barycentrics,
+        depth=jnp.where(covered, depth, 1.0),
+        w=jnp.where(covered, 1.0 / over_w, 0.0),
+    )
 
 
-def _cover(triangles: ScreenTriangles, triangle: Int[Array, " n"], x, y, lanes: _Lanes):
-    """Whether the samples of each tile lie in its triangle, and the triangle's depth there."""
-    xy, z, area = triangles.xy[triangle], triangles.z[triangle], triangles.area[triangle]
-    c, dx, dy = edges(xy, x, y, unit=lanes.unit)
+def _cover(triangles, planes, triangle: Int[Array, " n"], x: Int[Array, " n"], y: Int[Array, " n"], lanes: _Lanes):
+    """Whether the samples of each tile lie in its triangle; its depth there, and the other three planes."""
+    area, corners = triangles.area[triangle], planes[triangle]
+    c, dx, dy, value = edges(triangles.xy[triangle], x, y, unit=lanes.unit)
     # The sign bit of the three together is set as soon as one is negative.
     sign = functools.reduce(
         jnp.bitwise_or,
         (c[:, k, None] + dx[:, k, None] * lanes.y[None] - dy[:, k, None] * lanes.x[None] for k in range(3)),
     )
-    corners = xy.astype(z.dtype)
-    a, b, za, zb = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], z[:, 1] - z[:, 0], z[:, 2] - z[:, 0]
-    slope_x, slope_y = (za * b[:, 1] - zb * a[:, 1]) / area, (zb * a[:, 0] - za * b[:, 0]) / area
-    here = z[:, 0] + slope_x * (x.astype(z.dtype) - corners[:, 0, 0]) + slope_y * (y.astype(z.dtype) - corners[:, 0, 1])
-    along_x, along_y = (lanes.unit * steps.astype(np.float32)[None] for steps in (lanes.x, lanes.y))
-    depth = here[:, None] + slope_x[:, None] * along_x + slope_y[:, None] * along_y
-    # On a sliver the plane may be steep beyond float32; no point of a triangle is deeper than its corners.
-    return sign >= 0, jnp.clip(depth, z.min(axis=1)[:, None], z.max(axis=1)[:, None])
-
-
-def _finish(triangles: ScreenTriangles, winner, depth, x, y, lanes: _Lanes) -> TileSamples:
-    """Barycentrics and w of the samples that something covers."""
-    covered = winner >= 0
-    row = jnp.where(covered, winner, 0)
-    px, py = x[:, None] + lanes.unit * lanes.x[None], y[:, None] + lanes.unit * lanes.y[None]
-    screen = screen_barycentrics(triangles.xy[row], triangles.area[row], px, py)
-    weights, w = perspective_weights(screen, triangles.w[row], triangles.weights[row])
-    return TileSamples(
-        screen_id=winner,
-        barycentrics=jnp.where(covered[..., None], weights[..., 1:], 0.0),
-        depth=jnp.where(covered, depth, 1.0),
-        w=jnp.where(covered, w, 0.0),
+    # Corner k lies opposite to edge k+1. Values at the tile come from exact edge functions, so that a plane is as
+    # good far from the corners as near to them; from there on it is 16 pixels at most.
+    weights, to_right, down = (
+        jnp.roll(v, -1, axis=1)[..., None] / area[:, None, None]
+        for v in (value, -lanes.unit * dy.astype(area.dtype), lanes.unit * dx.astype(area.dtype))
     )
+    here, slope_x, slope_y = (jnp.sum(v * corners, axis=1) for v in (weights, to_right, down))
+    along_x, along_y = (steps.astype(np.float32)[None] for steps in (lanes.x, lanes.y))
+    z, *rest = (here[:, k, None] + slope_x[:, k, None] * along_x + slope_y[:, k, None] * along_y for k in range(4))
+    # On a sliver the plane may be steep beyond float32; no point of a triangle is deeper than its corners.
+    z = jnp.clip(z, corners[:, :, 0].min(axis=1)[:, None], corners[:, :, 0].max(axis=1)[:, None])
+    return sign >= 0, z, rest
 
 
 def _assemble(
-    faces: Int[Array, "t 3"],
-    triangles: ScreenTriangles,
-    order: Int[Array, "chunks n"],
-    tiles: TileSamples,
-    grid: TileGrid,
-    samples: Samples,
+    faces: Int[Array, "t 3"], triangles: ScreenTriangles, cells: Cells, plan: _Plan, samples: Samples
 ) -> Fragments:
-    """Puts the tiles in their places."""
-    size, s = grid.size, len(samples.offsets)
-    at = jnp.where(order >= 0, order, grid.count).reshape(-1)
-    m, h, w = samples.grid, grid.height // samples.grid, grid.width // samples.grid
+    """Strips of cells (k, rows, columns, s) -> pixels; an ordered grid has m x m cells a pixel."""
+    m, h, w = samples.grid, plan.grid.height // samples.grid, plan.grid.width // samples.grid
+    s = len(samples.offsets)
 
     def image(values: Array) -> Array:
-        rest = values.shape[3:]
-        flat = values.reshape(-1, size, size, s, *rest)
-        placed = jnp.zeros((grid.count, *flat.shape[1:]), flat.dtype).at[at].set(flat, mode="drop", unique_indices=True)
-        rows = placed.reshape(grid.rows, grid.columns, size, size, s, *rest).swapaxes(1, 2)
-        cells = rows.reshape(grid.rows * size, grid.columns * size, s, *rest)[: grid.height, : grid.width]
-        pixels = cells.reshape(h, m, w, m, s, *rest).swapaxes(1, 2)
+        rest = values.shape[4:]
+        rows = values.shape[0] * values.shape[1]
+        whole = values.reshape(rows, *values.shape[2:])[: plan.grid.height, : plan.grid.width]
+        pixels = whole.reshape(h, m, w, m, s, *rest).swapaxes(1, 2)
         return pixels.reshape(h, w, m * m * s, *rest)
 
-    screen_id = image(tiles.screen_id)
-    source = jnp.where(screen_id >= 0, triangles.source[screen_id], -1)
+    own = jax.tree.map(image, cells)
     return Fragments(
-        triangle_id=source, screen_id=screen_id, barycentrics=image(tiles.barycentrics), depth=image(tiles.depth),
-        w=image(tiles.w), faces=faces, triangles=triangles, samples=samples,
+        triangle_id=own.triangle_id, screen_id=own.screen_id, barycentrics=own.barycentrics, depth=own.depth, w=own.w,
+        faces=faces, triangles=triangles, samples=samples,
     )  # fmt: skip
 
 
@@ -311,15 +341,17 @@ def rasterize(
     runs, total = _spans(triangles, grid, pattern, first_row, num_rows, max_spans=_room(int(total)))
     tile, triangle = _pairs(runs, max_pairs=_room(int(total)), num_tiles=grid.count)
     lists = _sorted_lists(tile, triangle, grid.count)
+    # On a processor several strips are under way at once; on another device the whole image is one.
     on_cpu = jax.default_backend() == "cpu"
-    order = np.asarray(_tiles_by_work(lists.count, 128 if on_cpu else 16384))
-    parts = num_cores() if on_cpu else 1
-    orders = [order[part::parts] for part in range(parts)]
-    fill = lambda own: jax.block_until_ready(_fill(triangles, lists, own, grid, pattern))  # noqa: E731
-    with ThreadPoolExecutor(parts) as threads:
-        filled = list(threads.map(fill, orders))
-    tiles = jax.tree.map(lambda *values: jnp.concatenate(values), *filled)
-    return _assemble_jit(faces, triangles, jnp.concatenate([jnp.asarray(own) for own in orders]), tiles, grid, samples)
+    plan = _plan(grid, pattern, 128) if on_cpu else _plan(grid, pattern, 16384, tiles_per_strip=grid.count)
+    parts = (
+        np.array_split(np.arange(plan.num_strips), max(1, min(plan.num_strips, 4 * num_cores()))) if on_cpu else [[0]]
+    )
+    fill = lambda own: jax.block_until_ready(_fill(triangles, lists, jnp.asarray(own, jnp.int32), plan))  # noqa: E731
+    with ThreadPoolExecutor(num_cores() if on_cpu else 1) as threads:
+        filled = list(threads.map(fill, parts))
+    cells = jax.tree.map(lambda *values: jnp.concatenate(values), *filled)
+    return _assemble_jit(faces, triangles, cells, plan, samples)
 
 
 def _check_indices(faces: Int[Array, "t 3"], num_vertices: int) -> None:
@@ -357,8 +389,8 @@ def _spans(triangles, grid, pattern, first_row, num_rows, *, max_spans):
 _pairs = jax.jit(pairs, static_argnames=("max_pairs", "num_tiles"))
 _sort_pairs = jax.jit(sort_pairs, static_argnames="num_tiles")
 _tile_lists = jax.jit(tile_lists, static_argnames="num_tiles")
-_fill = jax.jit(fill_tiles, static_argnames=("grid", "pattern"))
-_assemble_jit = jax.jit(_assemble, static_argnames=("grid", "samples"))
+_fill = jax.jit(fill_strips, static_argnames="plan")
+_assemble_jit = jax.jit(_assemble, static_argnames=("plan", "samples"))
 
 
 def _sorted_lists(tile: Int[Array, " p"], triangle: Int[Array, " p"], num_tiles: int) -> TileLists:

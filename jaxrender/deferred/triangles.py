@@ -76,8 +76,8 @@ def project_triangles(clipped: ClippedTriangles, *, height: int, width: int, cul
 
 
 def edges(
-    xy: Int[Array, "*b 3 2"], px: Int[Array, "*b"], py: Int[Array, "*b"], *, unit: int, inclusive: bool = False
-) -> tuple[Int[Array, "*b 3"], Int[Array, "*b 3"], Int[Array, "*b 3"]]:
+    xy: Int[Array, "*b 3 2"], px: Int[Array, "*b"], py: Int[Array, "*b"], *, unit: int
+) -> tuple[Int[Array, "*b 3"], Int[Array, "*b 3"], Int[Array, "*b 3"], Float[Array, "*b 3"]]:
     """Edge functions around a point, ready to be compared with 0 at all sample positions nearby.
 
     Edge k runs from corner k to corner k+1. With steps i to the right and j down, each of `unit` snapped units, a
@@ -85,18 +85,19 @@ def edges(
     function at (px, py), less 1 for edges that do not own their samples, divided by `unit` and rounded down.
 
     Args:
-      unit: a power of two. `inclusive`: every edge owns its samples.
+      unit: a power of two.
     Returns:
-      c, dx, dy.
+      c, dx, dy, and the edge function itself in float32.
     References:
       Direct3D 11 functional specification, 3.4.2 (top-left rule).
     """
     start, end = xy, jnp.roll(xy, -1, axis=-2)
     dx, dy = end[..., 0] - start[..., 0], end[..., 1] - start[..., 1]
     owns = (dy == 0) & (dx > 0) | (dy < 0)
-    bias = jnp.zeros_like(dx) if inclusive else 1 - owns.astype(jnp.int32)
+    bias = 1 - owns.astype(jnp.int32)
     high, low = cross_product(dx, dy, px[..., None] - start[..., 0], py[..., None] - start[..., 1], bias=bias)
-    return divide_by(high, low, bits=unit.bit_length() - 1), dx, dy
+    value = to_float(high, low) + bias.astype(jnp.float32)
+    return divide_by(high, low, bits=unit.bit_length() - 1), dx, dy, value
 
 
 def screen_barycentrics(
