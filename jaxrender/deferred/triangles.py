@@ -26,7 +26,7 @@ class ScreenTriangles:
       z: window depth z/w of the corners, 0 at the near plane and 1 at the far plane.
       w: clip w of the corners; for a perspective camera their linear view depth.
       weights: barycentrics of the corners in the source triangle.
-      area: twice the area in snapped units squared, > 0.
+      area: twice the area in snapped units squared; 1 if there is none.
       source: the triangle of the mesh.
       order: the order to draw in.
       front: whether the source is seen from its counter-clockwise side.
@@ -64,6 +64,7 @@ def project_triangles(clipped: ClippedTriangles, *, height: int, width: int, cul
     front = high < 0
     area = jnp.abs(to_float(high, low))
     valid = valid & (area > 0)
+    area = jnp.where(area > 0, area, jnp.ones_like(area))
     if cull != "none":
         valid &= front if cull == "back" else ~front
     swap = lambda values: jnp.where(  # noqa: E731
