@@ -16,8 +16,11 @@ The rooms are subpackages: `jaxrender.io` (files), `jaxrender.animation` (skelet
 
 from jaxrender.camera import Camera as Camera
 from jaxrender.checks import InputError as InputError
+from jaxrender.scene import Lights as Lights
+from jaxrender.scene import Material as Material
 from jaxrender.scene import Mesh as Mesh
 from jaxrender.scene import MeshSequence as MeshSequence
+from jaxrender.scene import Scene as Scene
 from jaxrender.scene import make_mesh_sequence as make_mesh_sequence
 from jaxrender.scene import vertex_normals as vertex_normals
 

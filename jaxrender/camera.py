@@ -1,4 +1,4 @@
-"""The pinhole camera: transforms between world, view and pixels, camera rays, and automatic framing.
+"""The pinhole camera: transforms between world, view, clip space and pixels, camera rays, and automatic framing.
 
 View space has x to the right, y up and the eye looking down -z. Pixel (row, column) = (0, 0) is the top
 left one, and its centre is at (0.5, 0.5) in `_px` coordinates (x to the right, y down). All of it is
@@ -14,6 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrender import checks, vecmath
+
+#: The corners of a box, as signs of x, y and z from its middle.
+_BOX_CORNERS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1).reshape(8, 3)
 
 
 @jax.tree_util.register_dataclass
@@ -70,6 +73,58 @@ def camera_rays(
     view = vecmath.normalize(jnp.stack([x, y, -jnp.ones_like(x)], axis=-1))
     directions = view @ look_at(camera.eye, camera.target, camera.up).T
     return jnp.broadcast_to(camera.eye, directions.shape), directions
+
+
+def clip_from_world(
+    camera: Camera,
+    *,
+    height: int,
+    width: int,
+    near: int | float | Float[Array, ""],
+    far: int | float | Float[Array, ""],
+) -> Float[Array, "4 4"]:
+    """The projection of homogeneous world points to clip space: visible where -w <= x, y <= w and 0 <= z <= w.
+
+    y is up, w is the linear view depth, and z / w runs from 0 at `near` to 1 at `far`: the clip space of
+    Direct3D, Vulkan and WebGPU. Differentiable in the camera, `near` and `far`.
+
+    Args:
+      near, far: linear view depths with 0 < near < far, both finite; see `depth_range`.
+    Raises:
+      ValueError: if height or width is below 1, or near and far are numbers out of order.
+    """
+    checks.check_at_least("height", height, 1)
+    checks.check_at_least("width", width, 1)
+    if isinstance(near, int | float) and isinstance(far, int | float) and not 0 < near < far < math.inf:
+        raise ValueError(f"near, far: expected 0 < near < far, both finite, got {near} and {far}")
+    dtype = camera.eye.dtype
+    near, far = jnp.asarray(near, dtype), jnp.asarray(far, dtype)
+    y = 1.0 / jnp.tan(0.5 * camera.fov_y_radians)
+    x, z, one, zero = y * (height / width), far / (near - far), jnp.ones_like(y), jnp.zeros_like(y)
+    rows = [[x, zero, zero, zero], [zero, y, zero, zero], [zero, zero, z, near * z], [zero, zero, -one, zero]]
+    clip_from_view = jnp.stack([jnp.stack(row) for row in rows])
+    return vecmath.matmul(clip_from_view, view_from_world(camera))
+
+
+def depth_range(
+    camera: Camera, minimum: Float[Array, "3"], maximum: Float[Array, "3"], *, smallest_ratio: float = 1e-3
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Depths `near` and `far` that hold the part of a box that is in front of the eye, for `clip_from_world`.
+
+    Both leave 1 % of room. A box wholly behind the eye gives 1e-3 and 1, times its distance.
+
+    Args:
+      smallest_ratio: near is at least this share of far, as float32 depth needs, also for an eye inside the box.
+    """
+    dtype = camera.eye.dtype
+    low = jnp.asarray(_BOX_CORNERS < 0)
+    corners = jnp.where(low, jnp.broadcast_to(minimum, (8, 3)), jnp.broadcast_to(maximum, (8, 3)))
+    backward = look_at(camera.eye, camera.target, camera.up)[:, 2]
+    depth = vecmath.matmul(jnp.broadcast_to(camera.eye, (8, 3)) - corners, backward)
+    deepest = jnp.max(depth)
+    fallback = jnp.max(jnp.abs(depth))
+    far = 1.01 * jnp.where(deepest > 0, deepest, jnp.where(fallback > 0, fallback, jnp.ones((), dtype)))
+    return jnp.maximum(0.99 * jnp.min(depth), smallest_ratio * far), far
 
 
 def project_px(
@@ -133,8 +188,7 @@ def frame_bounds(
         ]
     )
     center, half = 0.5 * (minimum + maximum), 0.5 * (1.0 + margin) * (maximum - minimum)
-    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1).reshape(8, 3)
-    corners = jnp.asarray(signs, dtype) * jnp.broadcast_to(half, (8, 3))
+    corners = jnp.asarray(_BOX_CORNERS, dtype) * jnp.broadcast_to(half, (8, 3))
     x, y, z = (corners @ look_at(backward, jnp.zeros_like(backward), up)).T
     tangent = math.tan(0.5 * fov_y_radians)
     distance = jnp.max(z + jnp.maximum(jnp.abs(x) / (tangent * aspect), jnp.abs(y) / tangent))

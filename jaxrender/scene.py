@@ -1,13 +1,19 @@
-"""What goes into the methods: meshes, and meshes that move."""
+"""What goes into the methods: meshes, meshes that move, and scenes with materials, lights and cameras."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from jaxrender.camera import Camera, frame_bounds
 from jaxrender.vecmath import frame_from_normal_tangent, normalize
+
+#: Values of `Material.alpha_mode`.
+OPAQUE, MASK, BLEND = 0, 1, 2
+#: Values of `Lights.kind`.
+DIRECTIONAL, POINT, SPOT = 0, 1, 2
 
 
 @jax.tree_util.register_dataclass
@@ -38,6 +44,128 @@ class MeshSequence:
     @property
     def normals(self) -> Float[Array, "f v 3"]:
         return self.frames[..., 2]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Material:
+    """Metallic-roughness materials in the terms of glTF 2.0: by id (m leading), or gathered at pixels (h, w leading).
+
+    Factors multiply what the texture of the same name gives, and colors are linear. A `*_texture` is an index into
+    `Scene.images`, which is a layer of the textures built from them; -1 is none.
+
+    Attributes:
+      base_color: RGB and alpha, in [0, 1]; vertex colors multiply it as well.
+      metallic, roughness: in [0, 1]; blue and green of their texture. roughness is perceptual: alpha is its square.
+      emissive: radiance, >= 0, unbounded.
+      normal_scale: of x and y of the normal map. occlusion_strength: in [0, 1]; the red of its texture.
+      alpha_mode: OPAQUE (alpha means nothing), MASK (discard where alpha < alpha_cutoff) or BLEND.
+      double_sided: back faces are seen, with their normal turned round.
+    """
+
+    base_color: Float[Array, "*m 4"]
+    metallic: Float[Array, "*m"]
+    roughness: Float[Array, "*m"]
+    emissive: Float[Array, "*m 3"]
+    normal_scale: Float[Array, "*m"]
+    occlusion_strength: Float[Array, "*m"]
+    alpha_mode: Int[Array, "*m"]
+    alpha_cutoff: Float[Array, "*m"]
+    double_sided: Bool[Array, "*m"]
+    base_color_texture: Int[Array, "*m"]
+    metallic_roughness_texture: Int[Array, "*m"]
+    normal_texture: Int[Array, "*m"]
+    occlusion_texture: Int[Array, "*m"]
+    emissive_texture: Int[Array, "*m"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Lights:
+    """n lights without extent, as in KHR_lights_punctual; every field is there for every kind.
+
+    Attributes:
+      kind: DIRECTIONAL, POINT or SPOT.
+      position: in the world; 0 for a directional light.
+      direction: unit, the way the light travels (from the lamp); (0, 0, -1) for a point light.
+      intensity: linear RGB. Of a directional light the irradiance on a surface that faces it (lux in photometric
+        files, else W/m2); of the others the radiant intensity (candela, else W/sr): irradiance times distance squared.
+      range: the distance at which the light ends, smoothly (see the extension); inf for none.
+      cos_inner, cos_outer: of the angles from the axis of a spot where it begins to fall and is 0; -1 otherwise.
+    """
+
+    kind: Int[Array, " n"]
+    position: Float[Array, "n 3"]
+    direction: Float[Array, "n 3"]
+    intensity: Float[Array, "n 3"]
+    range: Float[Array, " n"]
+    cos_inner: Float[Array, " n"]
+    cos_outer: Float[Array, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneImage:
+    """A decoded picture as a file has it. It stays on the host; `jit` tells two apart by identity.
+
+    Attributes:
+      texels: row 0 on top, where v = 0.
+      wrap: in u and v: "repeat", "clamp" or "mirror".
+      srgb: the RGB channels are sRGB (colors), not linear (data such as normals); alpha is always linear.
+    """
+
+    name: str
+    texels: UInt8[np.ndarray, "h w c"]
+    wrap: tuple[str, str]
+    srgb: bool
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Scene:
+    """Everything a file says about a scene, as one triangle mesh in world space, with its materials and lights.
+
+    Attributes:
+      normals: unit shading normals, on the side from which faces are counter-clockwise.
+      tangents: unit, orthogonal to the normal, along growing u; the bitangent (green of a normal map, towards
+        decreasing v) is w cross(normal, tangent), w = 1 or -1.
+      uv: (0, 0) is the upper left corner of an image. Not limited to [0, 1].
+      colors: linear RGBA by vertex, 1 where the file has none.
+      material_id: by triangle, into the fields of `material`.
+      cameras: those of the file, in its order.
+      images: what the texture indices of `material` refer to; `material_names` is by id.
+      notes: what was repaired or left out, for people to read.
+    """
+
+    positions: Float[Array, "v 3"]
+    normals: Float[Array, "v 3"]
+    tangents: Float[Array, "v 4"]
+    uv: Float[Array, "v 2"]
+    colors: Float[Array, "v 4"]
+    faces: Int[Array, "t 3"]
+    material_id: Int[Array, " t"]
+    material: Material
+    lights: Lights
+    cameras: tuple[Camera, ...]
+    name: str = field(metadata={"static": True})
+    images: tuple[SceneImage, ...] = field(default=(), metadata={"static": True})
+    material_names: tuple[str, ...] = field(default=(), metadata={"static": True})
+    notes: tuple[str, ...] = field(default=(), metadata={"static": True})
+
+
+def scene_bounds(scene: Scene) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """The smallest box that holds all triangles: its lowest and its highest corner."""
+    used = jnp.zeros(len(scene.positions), bool).at[scene.faces].set(True)[:, None]
+    lowest, highest = (jnp.where(used, scene.positions, bound) for bound in (jnp.inf, -jnp.inf))
+    return jnp.min(lowest, axis=0), jnp.max(highest, axis=0)
+
+
+def whole_scene_camera(
+    scene: Scene, *, aspect: int | float = 1.0, azimuth_radians: float = 0.6, elevation_radians: float = 0.35
+) -> Camera:
+    """A camera outside the scene that sees all of it, from the right and above; the angles as in `frame_bounds`."""
+    return frame_bounds(
+        *scene_bounds(scene), azimuth_radians=azimuth_radians, elevation_radians=elevation_radians, aspect=aspect
+    )
 
 
 def vertex_normals(vertices: Float[Array, "*b v 3"], faces: Int[Array, "t 3"]) -> Float[Array, "*b v 3"]:

@@ -31,6 +31,7 @@ PROMISED = {
         "membrane": None,
     },
     "jaxrender.io": {
+        "load_scene": ("path",),
         "load_character": ("path",),
         "load_bvh": ("path",),
         "read_exr": ("path",),

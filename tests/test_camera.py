@@ -7,7 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrender.camera import Camera, camera_rays, frame_bounds, look_at, project_px, view_from_world
+from jaxrender.camera import (
+    Camera,
+    camera_rays,
+    clip_from_world,
+    depth_range,
+    frame_bounds,
+    look_at,
+    project_px,
+    view_from_world,
+)
 
 
 def make_camera(eye=(0.0, 0.0, 5.0), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0), fov_degrees=60.0):
@@ -98,6 +107,47 @@ def test_project_is_the_inverse_of_rays(rng):
 def test_point_in_the_plane_of_the_eye_is_finite():
     px, depth = project_px(make_camera(), jnp.asarray([[1.0, 2.0, 5.0]], jnp.float32), height=4, width=4)
     assert depth[0] == 0 and np.isfinite(px).all()
+
+
+def test_clip_space_is_that_of_the_pixels_and_depths(rng):
+    camera = make_camera(eye=(1.0, 2.0, 3.0), target=(0.2, 0.1, 0.0), fov_degrees=50.0)
+    points = jnp.asarray(rng.normal(size=(20, 3)), jnp.float32)
+    matrix = jax.jit(clip_from_world, static_argnames=("height", "width"))(
+        camera, height=60, width=90, near=0.5, far=8.0
+    )
+    clip = np.pad(np.asarray(points, np.float64), ((0, 0), (0, 1)), constant_values=1.0) @ np.asarray(matrix).T
+    px, depth = project_px(camera, points, height=60, width=90)
+    # Row 0 of an image is on top, y of clip space is up.
+    at = np.stack([90 * (0.5 + 0.5 * clip[:, 0] / clip[:, 3]), 60 * (0.5 - 0.5 * clip[:, 1] / clip[:, 3])], axis=1)
+    np.testing.assert_allclose(at, px, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(clip[:, 3], depth, rtol=1e-5, atol=1e-6)
+    # Linear in 1/w, 0 at near and 1 at far.
+    np.testing.assert_allclose(clip[:, 2] / clip[:, 3], (1 / 0.5 - 1 / clip[:, 3]) / (1 / 0.5 - 1 / 8.0), atol=1e-4)
+
+
+def test_clip_space_against_the_matrix_of_the_direct3d_manual():
+    """XMMatrixPerspectiveFovRH, transposed for column vectors, at the origin."""
+    camera = make_camera(eye=(0.0, 0.0, 0.0), target=(0.0, 0.0, -1.0), fov_degrees=90.0)
+    matrix = clip_from_world(camera, height=1, width=2, near=1, far=3)
+    expected = [[0.5, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1.5, -1.5], [0, 0, -1, 0]]
+    np.testing.assert_allclose(matrix, expected, atol=1e-6)
+
+
+def test_depth_range_holds_the_box_in_front():
+    low, high = jnp.asarray([-1.0, -1.0, -1.0]), jnp.asarray([1.0, 1.0, 1.0])
+    ranges = jax.jit(lambda z: depth_range(make_camera(eye=(0.0, 0.0, 5.0), target=(0.0, 0.0, z)), low, high))
+    near, far = ranges(0.0)
+    np.testing.assert_allclose([near, far], [0.99 * 4, 1.01 * 6], rtol=1e-6)
+    behind = ranges(9.0)
+    assert 0 < behind[0] < behind[1] < np.inf
+    inside = depth_range(make_camera(eye=(0.0, 0.0, 0.5), target=(0.0, 0.0, 0.0)), low, high, smallest_ratio=0.01)
+    np.testing.assert_allclose(inside, [0.01 * 1.515, 1.515], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.0, 1.0), (2.0, 1.0), (1, math.inf), (math.nan, 1.0)])
+def test_bad_depths(near, far):
+    with pytest.raises(ValueError, match="near, far: expected 0 < near < far"):
+        clip_from_world(make_camera(), height=2, width=2, near=near, far=far)
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.9])

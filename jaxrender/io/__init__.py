@@ -6,3 +6,4 @@ from jaxrender.io.exr import read_exr as read_exr
 from jaxrender.io.exr import write_exr as write_exr
 from jaxrender.io.hdr import read_environment as read_environment
 from jaxrender.io.picture import write_png as write_png
+from jaxrender.io.scene import load_scene as load_scene

@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrender.animation.skinning import Character, Skin
-from jaxrender.io.gltf_accessors import LARGEST_NUMBER, read_floats
+from jaxrender.io.gltf_accessors import LARGEST_NUMBER
 from jaxrender.io.gltf_clips import read_clips
 from jaxrender.io.gltf_container import Container, printable
 from jaxrender.io.gltf_meshes import Surface, read_surface
-from jaxrender.io.gltf_nodes import build_skeleton, read_nodes, scene_nodes
+from jaxrender.io.gltf_nodes import build_skeleton, read_inverse_binds, read_nodes, scene_nodes
 
 
 def read_gltf(path: str | os.PathLike) -> Character:
@@ -84,7 +84,7 @@ class _Palette:
         """The first entry of a skin and the number of its joints."""
         skin = self._source.item("skins", index, where)
         if ("skin", index) not in self._first_entry:
-            inverse_binds = _read_skin(self._source, skin, f"skins[{index}]")
+            inverse_binds = read_inverse_binds(self._source, skin, f"skins[{index}]")
             self._block(("skin", index), skin.joints, inverse_binds)
         return self._first_entry["skin", index], len(skin.joints)
 
@@ -97,26 +97,6 @@ class _Palette:
             self.nodes.extend(nodes)
             self._inverse_binds.append(inverse_binds)
         return self._first_entry[key]
-
-
-def _read_skin(source: Container, skin: Any, field: str) -> np.ndarray:
-    """Inverse bind matrices of a skin's joints, which are checked; the identity where the file has none."""
-    count, where = len(skin.joints), f"{field}.inverseBindMatrices"
-    if not skin.joints:
-        source.bad(f"{field}.joints", expected="at least one joint", got="none")
-    for node in skin.joints:
-        source.item("nodes", node, f"{field}.joints")
-    if skin.inverseBindMatrices is None:
-        source.spend(16 * count, where)
-        return np.broadcast_to(np.eye(4), (count, 4, 4))
-    columns = read_floats(source, skin.inverseBindMatrices, ("MAT4",), where)
-    if len(columns) < count:
-        source.bad(where, expected=f"{count} matrices, one a joint", got=len(columns))
-    matrices = columns[:count].reshape(-1, 4, 4).swapaxes(1, 2).astype(np.float64)
-    if not np.allclose(matrices[:, 3], [0, 0, 0, 1], rtol=0, atol=1e-3):
-        source.bad(where, expected="affine matrices (last row 0 0 0 1)", got="others")
-    matrices[:, 3] = [0, 0, 0, 1]
-    return matrices
 
 
 def _read_instance(source: Container, node_index: int, palette: _Palette) -> list[Surface]:

@@ -48,6 +48,17 @@ def read_integers(source: Container, index: Any, types: tuple[str, ...], where: 
     return raw.astype(np.int64)
 
 
+def one_a_vertex(source: Container, values: np.ndarray, num_vertices: int, where: str) -> np.ndarray:
+    """The rows of an attribute, if there is one for each vertex.
+
+    Raises:
+      InputError: otherwise.
+    """
+    if len(values) != num_vertices:
+        source.bad(where, expected=f"{num_vertices} elements, as POSITION has", got=len(values))
+    return values
+
+
 def _read(source: Container, index: Any, types: tuple[str, ...], where: str) -> np.ndarray:
     accessor = source.item("accessors", index, where)
     field = f"accessors[{index}]"

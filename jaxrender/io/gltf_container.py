@@ -43,7 +43,7 @@ class Container:
         self.path = path
         self._repairs: collections.Counter[str] = collections.Counter()
         self._numbers_read = 0
-        self._data = _read_file(path, path, "file")
+        self._data = read_file(path, path, "file")
         self.gltf = _parse(path, self._data)
         self._buffers: dict[int, bytes] = {}
         self.images: dict[int, np.ndarray] = {}  # decoded ones
@@ -106,7 +106,7 @@ class Container:
         """The bytes behind a URI: embedded in it, or a file in this file's folder."""
         if uri.startswith("data:"):
             return self._embedded(uri, where)
-        return _read_file(self._inside_folder(uri, where), self.path, where)
+        return read_file(self._inside_folder(uri, where), self.path, where)
 
     def whole(self, value: Any, where: str, *, at_least: int = 0) -> int:
         """A whole number that is not missing and not below `at_least`; missing is 0 where 0 is allowed."""
@@ -159,7 +159,7 @@ def printable(text: object) -> str:
     return line if len(line) <= 80 else line[:79] + "…"
 
 
-def _read_file(path: pathlib.Path, about: pathlib.Path, field: str) -> bytes:
+def read_file(path: pathlib.Path, about: pathlib.Path, field: str) -> bytes:
     """The bytes of an ordinary file; a pipe or a device would keep us waiting for ever."""
     try:
         if not path.is_file():

@@ -36,28 +36,22 @@ def read_surface(source: Container, primitive: Any, num_joints: int | None, wher
     Args:
       num_joints: of the skin of its node; None for a rigid mesh, which gets weight 1 on entry 0.
     """
-    attributes = _attributes(source, primitive, where)
     if primitive.targets:
         source.bad(f"{where}.targets", expected="no morph targets (not supported)", got=len(primitive.targets))
-    source.spend(_COST_OF_A_PRIMITIVE, where)
-    if "KHR_draco_mesh_compression" in primitive.extensions:
-        if source.item("accessors", attributes["POSITION"], f"{where}.POSITION").bufferView is None:
-            source.bad(where, expected="uncompressed data", got="Draco only (KHR_draco_mesh_compression)")
-    if primitive.mode in _POINTS_AND_LINES:
-        source.note("primitives of points or lines left out")
+    triangles = read_triangles(source, primitive, where)
+    if triangles is None:
         return None
-    vertices = read_floats(source, attributes["POSITION"], ("VEC3",), f"{where}.POSITION")
-    faces = _read_faces(source, primitive, len(vertices), where)
+    attributes, vertices, faces = triangles
     faces = _without_flat_ones(source, vertices, faces)
     if not len(faces):
         return None
     if num_joints is None:
         joints, weights = np.zeros((len(vertices), 1), np.int64), np.ones((len(vertices), 1), np.float32)
     else:
-        joints, weights = _read_influences(source, attributes, len(vertices), where)
+        joints, weights = read_influences(source, attributes, len(vertices), where)
     surface = Surface(
         vertices=vertices,
-        normals=_read_normals(source, attributes, len(vertices), where),
+        normals=read_normals(source, attributes, len(vertices), where),
         faces=faces,
         albedo=read_albedo(source, attributes, primitive.material, len(vertices), where),
         joints=joints,
@@ -67,8 +61,25 @@ def read_surface(source: Container, primitive: Any, num_joints: int | None, wher
     flat = "NORMAL" not in attributes
     kept = faces.ravel() if flat else np.unique(faces)
     surface = _gathered(surface, kept, flat=flat)
-    surface = replace(surface, normals=_unit_normals(source, surface))
-    return _checked_influences(source, surface, kept, num_joints or 1, where)
+    normals = unit_normals(source, surface.vertices, surface.normals, surface.faces)
+    joints, weights = checked_influences(source, surface.joints, surface.weights, kept, num_joints or 1, where)
+    return replace(surface, normals=normals, joints=joints, weights=weights)
+
+
+def read_triangles(
+    source: Container, primitive: Any, where: str
+) -> tuple[dict[str, Any], Float32[np.ndarray, "v 3"], Int64[np.ndarray, "t 3"]] | None:
+    """The attributes of a primitive by name, its positions and faces; None if it is of points or lines."""
+    attributes = _attributes(source, primitive, where)
+    source.spend(_COST_OF_A_PRIMITIVE, where)
+    if "KHR_draco_mesh_compression" in primitive.extensions:
+        if source.item("accessors", attributes["POSITION"], f"{where}.POSITION").bufferView is None:
+            source.bad(where, expected="uncompressed data", got="Draco only (KHR_draco_mesh_compression)")
+    if primitive.mode in _POINTS_AND_LINES:
+        source.note("primitives of points or lines left out")
+        return None
+    vertices = read_floats(source, attributes["POSITION"], ("VEC3",), f"{where}.POSITION")
+    return attributes, vertices, _read_faces(source, primitive, len(vertices), where)
 
 
 def _attributes(source: Container, primitive: Any, where: str) -> dict[str, Any]:
@@ -111,7 +122,7 @@ def _without_flat_ones(source: Container, vertices: np.ndarray, faces: np.ndarra
     return faces[keep]
 
 
-def _read_normals(source: Container, attributes: dict[str, Any], num_vertices: int, where: str) -> np.ndarray:
+def read_normals(source: Container, attributes: dict[str, Any], num_vertices: int, where: str) -> np.ndarray:
     """The normals of the file, zeros if it has none."""
     if "NORMAL" not in attributes:
         return np.zeros((num_vertices, 3), np.float32)
@@ -121,7 +132,7 @@ def _read_normals(source: Container, attributes: dict[str, Any], num_vertices: i
     return normals
 
 
-def _read_influences(
+def read_influences(
     source: Container, attributes: dict[str, Any], num_vertices: int, where: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Joints and weights of all sets side by side, as the file has them."""
@@ -157,32 +168,35 @@ def _gathered(surface: Surface, kept: np.ndarray, *, flat: bool) -> Surface:
     )
 
 
-def _unit_normals(source: Container, surface: Surface) -> np.ndarray:
+def unit_normals(
+    source: Container, vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray
+) -> Float32[np.ndarray, "v 3"]:
     """The normals at length 1; where there is none, that of a face at the vertex."""
-    normals = surface.normals.astype(np.float64)
+    normals = normals.astype(np.float64)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     lost = length[:, 0] < 1e-6
     if not lost.all():
         source.note("zero normals replaced by face normals", int(lost.sum()))
-    of_face = np.empty_like(normals)
-    of_face[surface.faces.ravel()] = np.repeat(_face_normals(surface), 3, axis=0)
+    of_face = np.zeros_like(normals)
+    of_face[faces.ravel()] = np.repeat(_face_normals(vertices, faces), 3, axis=0)
     return np.where(lost[:, None], of_face, normals / np.where(lost[:, None], 1.0, length)).astype(np.float32)
 
 
-def _face_normals(surface: Surface) -> Float64[np.ndarray, "t 3"]:
-    a, b, c = (surface.vertices[surface.faces[:, i]].astype(np.float64) for i in range(3))
+def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> Float64[np.ndarray, "t 3"]:
+    """Unit normals of faces; that of a face without area is +z."""
+    a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
     cross = np.cross(b - a, c - a)
-    return cross / np.linalg.norm(cross, axis=-1, keepdims=True)
+    length = np.linalg.norm(cross, axis=-1, keepdims=True)
+    return np.where(length > 0, cross / np.where(length > 0, length, 1.0), [[0.0, 0.0, 1.0]])
 
 
-def _checked_influences(
-    source: Container, surface: Surface, original: np.ndarray, num_joints: int, where: str
-) -> Surface:
-    """The surface with weights that sum to 1, the largest first, without columns that no vertex needs.
+def checked_influences(
+    source: Container, joints: np.ndarray, weights: np.ndarray, original: np.ndarray, num_joints: int, where: str
+) -> tuple[Int64[np.ndarray, "v k"], Float32[np.ndarray, "v k"]]:
+    """Joints and weights that sum to 1, the largest first, without columns that no vertex needs.
 
     InputError names the first vertex that is wrong.
     """
-    joints, weights = surface.joints, surface.weights
     for wrong, field, expected, values in (
         ((weights < 0).any(axis=1), "WEIGHTS", "weights >= 0", weights),
         ((joints >= num_joints) & (weights > 0), "JOINTS", f"indices below {num_joints}", joints),
@@ -200,4 +214,4 @@ def _checked_influences(
     largest_first = largest_first[:, : int((weights > 0).sum(axis=1).max())]
     weights = np.take_along_axis(weights / total, largest_first, axis=1).astype(np.float32)
     joints = np.take_along_axis(joints, largest_first, axis=1)
-    return replace(surface, joints=np.where(weights > 0, joints, 0), weights=weights)
+    return np.where(weights > 0, joints, 0), weights

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
 from jaxrender.animation.skeleton import Pose, Skeleton
-from jaxrender.io.gltf_accessors import LARGEST_NUMBER
+from jaxrender.io.gltf_accessors import LARGEST_NUMBER, read_floats
 from jaxrender.io.gltf_container import Container, printable
 
 _SHEAR_TOLERANCE = 1e-4
@@ -95,6 +96,26 @@ def build_skeleton(source: Container, graph: NodeGraph, needed: Iterable[int]) -
     )
     names = tuple(printable(source.gltf.nodes[node].name or f"node_{node}") for node in order)
     return Skeleton(names, tuple(joint_of.get(graph.parents[node], -1) for node in order), rest), joint_of
+
+
+def read_inverse_binds(source: Container, skin: Any, field: str) -> Float64[np.ndarray, "j 4 4"]:
+    """Inverse bind matrices of a skin's joints, which are checked; the identity where the file has none."""
+    count, where = len(skin.joints), f"{field}.inverseBindMatrices"
+    if not skin.joints:
+        source.bad(f"{field}.joints", expected="at least one joint", got="none")
+    for node in skin.joints:
+        source.item("nodes", node, f"{field}.joints")
+    if skin.inverseBindMatrices is None:
+        source.spend(16 * count, where)
+        return np.broadcast_to(np.eye(4), (count, 4, 4))
+    columns = read_floats(source, skin.inverseBindMatrices, ("MAT4",), where)
+    if len(columns) < count:
+        source.bad(where, expected=f"{count} matrices, one a joint", got=len(columns))
+    matrices = columns[:count].reshape(-1, 4, 4).swapaxes(1, 2).astype(np.float64)
+    if not np.allclose(matrices[:, 3], [0, 0, 0, 1], rtol=0, atol=1e-3):
+        source.bad(where, expected="affine matrices (last row 0 0 0 1)", got="others")
+    matrices[:, 3] = [0, 0, 0, 1]
+    return matrices
 
 
 def unit_quaternions(source: Container, q: np.ndarray, where: str) -> np.ndarray:
