@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from jaxrender import console, doctor
+from jaxrender.checks import check_at_least, check_one_of
 
 Out = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
 
@@ -82,6 +83,48 @@ class Relight:
 
 
 @dataclass(frozen=True)
+class Render:
+    """Renders a scene by rasterisation and deferred shading: a PNG, and with --exr the G-buffer as layers."""
+
+    scene: tyro.conf.Positional[Path | None] = None
+    """A glTF, GLB, PLY or OBJ file, or a scene.json. Without one, a built-in scene."""
+    out: Out = Path("out/render.png")
+    """The picture; with --exr a file of the same name ending in .exr is written beside it."""
+    size: tuple[int, int] = (1024, 768)
+    """Width and height in pixels."""
+    samples: int = 4
+    """Samples a pixel: 1, 2, 4, 8 or 16, all shaded."""
+    camera: int = 0
+    """Which of the file's cameras; without any, the whole scene is framed."""
+    eye: tuple[float, float, float] | None = None
+    """Where to look from, in the scene's units; then --target says where to."""
+    target: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What to look at, if --eye is given."""
+    fov_degrees: float = 60.0
+    """Vertical field of view, if --eye is given."""
+    exposure_stops: float = 0.0
+    """Brightens the PNG by powers of two."""
+    exr: bool = False
+    """Also write linear radiance, albedo, normals, position, depth, uv and ids as layers of an OpenEXR file."""
+    json: bool = False
+    """Print one JSON object instead of the list of files."""
+
+    def __post_init__(self):
+        if min(self.size) < 1:
+            raise ValueError(f"--size: expected two numbers of 1 or more, got {self.size[0]} {self.size[1]}")
+        check_one_of("--samples", self.samples, (1, 2, 4, 8, 16))
+        check_at_least("--camera", self.camera, 0)
+        if not 0.0 < self.fov_degrees < 180.0:
+            raise ValueError(f"--fov-degrees: expected an angle between 0 and 180, got {self.fov_degrees}")
+
+    def run(self) -> None:
+        from jaxrender.render_command import run_render
+
+        console.enable_compilation_cache()
+        run_render(self)
+
+
+@dataclass(frozen=True)
 class Doctor:
     """Says what is installed, what it runs on, and what each missing extra would add.
 
@@ -109,7 +152,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"jaxrender {doctor.package_version('jaxrender')}")
         return 0
     description = "Real-time rendering methods as pure tensor kernels."
-    commands = Demo | Relight | Doctor
+    commands = Demo | Render | Relight | Doctor
     return console.run_command(
         lambda: console.parse(commands, prog="jaxrender", description=description, argv=argv).run()
     )

@@ -8,6 +8,7 @@ Tiles are worked on in lockstep: a chunk of tiles, of about equally long lists, 
 second ones, and so on. All samples of a tile are lanes of one vector, and nothing is scattered.
 """
 
+import dataclasses
 import functools
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -173,22 +174,42 @@ class Cells:
     w: Float[Array, "*b s"]
 
 
-def fill_strips(triangles: ScreenTriangles, lists: TileLists, strips: Int[Array, " k"], plan: _Plan) -> Cells:
-    """Runs the depth test over some strips of the image; cells (k, rows, columns, s)."""
+def fill_strips(
+    triangles: ScreenTriangles,
+    lists: TileLists,
+    strips: Int[Array, " k"],
+    plan: _Plan,
+    beyond: Float[Array, "rows columns s"] | None = None,
+) -> Cells:
+    """Runs the depth test over some strips of the image; cells (k, rows, columns, s).
+
+    Args:
+      beyond: of every cell of all strips, the depth that a sample has to be deeper than.
+    """
     lanes, planes = _Lanes.of(plan.grid, plan.pattern), _planes(triangles)
-    return jax.lax.map(lambda strip: _fill_strip(triangles, planes, lists, strip, plan, lanes), strips)
+    return jax.lax.map(lambda strip: _fill_strip(triangles, planes, lists, strip, plan, lanes, beyond), strips)
 
 
-def _fill_strip(triangles, planes, lists: TileLists, strip: Int[Array, ""], plan: _Plan, lanes: "_Lanes") -> Cells:
+def _fill_strip(
+    triangles, planes, lists: TileLists, strip: Int[Array, ""], plan: _Plan, lanes: "_Lanes", beyond
+) -> Cells:
     """One strip: its tiles in order of their work, chunk by chunk, and back in their places."""
     n, chunk = plan.tiles_per_strip, plan.tiles_per_chunk
     tile = strip * n + jnp.arange(n, dtype=jnp.int32)
     tile = jnp.where(tile < plan.grid.count, tile, -1)
     order = jnp.argsort(-jnp.where(tile >= 0, lists.count[tile], 0), stable=True)
     chunks = jnp.concatenate([tile[order], jnp.full(-n % chunk, -1, jnp.int32)]).reshape(-1, chunk)
-    filled = jax.lax.map(lambda own: _fill_chunk(triangles, planes, lists, own, plan.grid, lanes), chunks)
-    place = jnp.zeros(n, jnp.int32).at[order].set(jnp.arange(n, dtype=jnp.int32))
     size, s = plan.grid.size, len(plan.pattern.offsets)
+    limits = jnp.zeros((n, 1), jnp.float32)
+    if beyond is not None:
+        rows = plan.rows_per_strip * size
+        own = jax.lax.dynamic_slice_in_dim(beyond, strip * rows, rows)
+        own = own.reshape(plan.rows_per_strip, size, plan.grid.columns, size, s).swapaxes(1, 2)
+        limits = own.reshape(n, size * size * s)[order]
+    limits = jnp.pad(limits, ((0, -n % chunk), (0, 0))).reshape(*chunks.shape, -1)
+    fill = lambda own: _fill_chunk(triangles, planes, lists, *own, plan.grid, lanes, beyond is not None)  # noqa: E731
+    filled = jax.lax.map(fill, (chunks, limits))
+    place = jnp.zeros(n, jnp.int32).at[order].set(jnp.arange(n, dtype=jnp.int32))
 
     def put(values: Array) -> Array:
         rest = values.shape[3:]
@@ -227,7 +248,9 @@ class _Lanes:
         return cls(0, SUBPIXELS // 16, x.astype(np.int32), y.astype(np.int32))
 
 
-def _fill_chunk(triangles, planes, lists: TileLists, tile: Int[Array, " n"], grid: TileGrid, lanes: _Lanes) -> Cells:
+def _fill_chunk(
+    triangles, planes, lists: TileLists, tile: Int[Array, " n"], limits, grid: TileGrid, lanes: _Lanes, limited: bool
+) -> Cells:
     """The triangles of each tile's list, one after another, for n tiles side by side; cells (n, lanes)."""
     x, y = (corner + lanes.base for corner in grid.corner(tile))
     start, count = lists.start[tile], jnp.where(tile >= 0, lists.count[tile], 0)
@@ -239,7 +262,7 @@ def _fill_chunk(triangles, planes, lists: TileLists, tile: Int[Array, " n"], gri
         triangle = lists.triangles[jnp.where(active, start + turn, 0)]
         inside, z, values = _cover(triangles, planes, triangle, x, y, lanes)
         # The far plane belongs to the picture; lists are in drawing order, so that the first one keeps a tie.
-        wins = inside & active[:, None] & (z >= 0.0) & (z <= 1.0) & (z < depth)
+        wins = inside & active[:, None] & (z > limits if limited else z >= 0.0) & (z <= 1.0) & (z < depth)
         held = [jnp.where(wins, new, old) for new, old in zip(values, held, strict=True)]
         return turn + 1, jnp.where(wins, triangle[:, None], winner), jnp.where(wins, z, depth), held
 
@@ -311,6 +334,9 @@ def rasterize(
     width: int,
     samples: Samples = CENTER,
     cull: str = "none",
+    drawn: Bool[Array, " t"] | None = None,
+    two_sided: Bool[Array, " t"] | None = None,
+    beyond: Float[Array, "h w s"] | None = None,
 ) -> Fragments:
     """Which triangle each sample of an image sees.
 
@@ -323,6 +349,9 @@ def rasterize(
       height, width: in pixels; at most 16382 samples a side.
       samples: one in the centre, `ordered_grid(m)` or `standard_pattern(n)`.
       cull: "none", "back" or "front".
+      drawn: which triangles to draw; all by default.
+      two_sided: triangles that are never culled.
+      beyond: window depth that a sample has to be deeper than: with the depth of one picture the next layer behind it.
     Raises:
       ValueError: if an index is out of range, or the image is too large.
     References:
@@ -332,12 +361,17 @@ def rasterize(
     check_last_axis("faces", faces, 3)
     _check_indices(faces, len(clip))
     h, w, grid, pattern = _frame(height, width, samples)
-    if not (h and w and len(faces)):
-        faces = jnp.zeros((1, 3), jnp.int32)
-        clip = jnp.zeros((1, 4), jnp.float32)
+    if not (h and w):
+        one = rasterize(clip, faces, height=1, width=1, samples=samples)
+        crop = lambda name: getattr(one, name)[:0].reshape(height, width, *getattr(one, name).shape[2:])  # noqa: E731
+        fields = ("triangle_id", "screen_id", "barycentrics", "depth", "w")
+        return dataclasses.replace(one, **{name: crop(name) for name in fields})
+    if not len(faces):
+        clip, faces, drawn, two_sided = jnp.zeros((1, 4), jnp.float32), jnp.zeros((1, 3), jnp.int32), None, None
     clip, faces = jnp.asarray(clip, jnp.float32), jnp.asarray(faces, jnp.int32)
     room = _room(int(_count_clipped(clip, faces, height=h, width=w)))
-    triangles, first_row, num_rows, total = _set_up(clip, faces, grid, pattern, cull=cull, max_clipped=room)
+    masks = {"drawn": drawn, "two_sided": two_sided}
+    triangles, first_row, num_rows, total = _set_up(clip, faces, grid, pattern, masks, cull=cull, max_clipped=room)
     runs, total = _spans(triangles, grid, pattern, first_row, num_rows, max_spans=_room(int(total)))
     tile, triangle = _pairs(runs, max_pairs=_room(int(total)), num_tiles=grid.count)
     lists = _sorted_lists(tile, triangle, grid.count)
@@ -347,11 +381,24 @@ def rasterize(
     parts = (
         np.array_split(np.arange(plan.num_strips), max(1, min(plan.num_strips, 4 * num_cores()))) if on_cpu else [[0]]
     )
-    fill = lambda own: jax.block_until_ready(_fill(triangles, lists, jnp.asarray(own, jnp.int32), plan))  # noqa: E731
+    limits = None if beyond is None else _cells_of(beyond, plan, samples)
+    fill = lambda own: jax.block_until_ready(  # noqa: E731
+        _fill(triangles, lists, jnp.asarray(own, jnp.int32), plan, limits)
+    )
     with ThreadPoolExecutor(num_cores() if on_cpu else 1) as threads:
         filled = list(threads.map(fill, parts))
     cells = jax.tree.map(lambda *values: jnp.concatenate(values), *filled)
     return _assemble_jit(faces, triangles, cells, plan, samples)
+
+
+@functools.partial(jax.jit, static_argnames=("plan", "samples"))
+def _cells_of(image: Float[Array, "h w s"], plan: _Plan, samples: Samples) -> Float[Array, "rows columns s"]:
+    """The reverse of `_assemble`: an image by pixels -> by cells, filled up to whole strips."""
+    (h, w, _), m, s = image.shape, samples.grid, len(samples.offsets)
+    cells = image.reshape(h, w, m, m, s).swapaxes(1, 2).reshape(h * m, w * m, s)
+    size = plan.grid.size
+    rows, columns = plan.num_strips * plan.rows_per_strip * size, plan.grid.columns * size
+    return jnp.pad(cells, ((0, rows - h * m), (0, columns - w * m), (0, 0)))
 
 
 def _check_indices(faces: Int[Array, "t 3"], num_vertices: int) -> None:
@@ -373,9 +420,9 @@ def _count_clipped(clip, faces, *, height, width):
 
 
 @functools.partial(jax.jit, static_argnames=("grid", "pattern", "cull", "max_clipped"))
-def _set_up(clip, faces, grid, pattern, *, cull, max_clipped):
+def _set_up(clip, faces, grid, pattern, masks, *, cull, max_clipped):
     clipped, _ = clip_triangles(clip, faces, height=grid.height, width=grid.width, max_clipped=max_clipped)
-    triangles = project_triangles(clipped, height=grid.height, width=grid.width, cull=cull)
+    triangles = project_triangles(clipped, height=grid.height, width=grid.width, cull=cull, **masks)
     first_row, num_rows = rows_of_triangles(triangles, grid, pattern)
     return triangles, first_row, num_rows, jnp.sum(num_rows)
 

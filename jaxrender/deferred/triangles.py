@@ -44,11 +44,21 @@ class ScreenTriangles:
     valid: Bool[Array, " n"]
 
 
-def project_triangles(clipped: ClippedTriangles, *, height: int, width: int, cull: str = "none") -> ScreenTriangles:
+def project_triangles(
+    clipped: ClippedTriangles,
+    *,
+    height: int,
+    width: int,
+    cull: str = "none",
+    drawn: Bool[Array, " t"] | None = None,
+    two_sided: Bool[Array, " t"] | None = None,
+) -> ScreenTriangles:
     """Viewport transform, snapping (round to nearest), winding and culling.
 
     Args:
       cull: "back" drops triangles that appear clockwise, "front" those that appear counter-clockwise.
+      drawn: by triangle of the mesh, whether it is drawn at all; every one by default.
+      two_sided: by triangle of the mesh, whether it is never culled.
     """
     check_one_of("cull", cull, CULLING)
     valid = clipped.valid
@@ -66,7 +76,10 @@ def project_triangles(clipped: ClippedTriangles, *, height: int, width: int, cul
     valid = valid & (area > 0)
     area = jnp.where(area > 0, area, jnp.ones_like(area))
     if cull != "none":
-        valid &= front if cull == "back" else ~front
+        right_way = front if cull == "back" else ~front
+        valid &= right_way if two_sided is None else right_way | two_sided[clipped.source]
+    if drawn is not None:
+        valid &= drawn[clipped.source]
     swap = lambda values: jnp.where(  # noqa: E731
         front.reshape(-1, *(1,) * (values.ndim - 1)), values[:, jnp.array([0, 2, 1])], values
     )

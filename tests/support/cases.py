@@ -751,11 +751,135 @@ def _skinning() -> list[Case]:
     ]
 
 
+def _textures() -> Record:
+    """Layers of 7 x 5 and 4 x 8 texels (w x h) with all levels, wrapped in four ways."""
+    layers = [[(7, 5), (3, 2), (1, 1), (1, 1)], [(4, 8), (2, 4), (1, 2), (1, 1)]]
+    sizes = np.array(layers, dtype=np.int32)
+    offset = np.array([[0, 35, 41, 41], [42, 74, 82, 84]], dtype=np.int32)
+    fields = {
+        "texels": _uniform(0, 1, 85, 4),
+        "offset": offset,
+        "width": sizes[..., 0].copy(),
+        "height": sizes[..., 1].copy(),
+        "num_levels": np.array([3, 4], dtype=np.int32),
+        "wrap": np.array([[0, 2], [1, 0]], dtype=np.int32),
+    }
+    return Record("deferred.texture.Textures", fields)
+
+
+def _axes_up_to_sign(axes: Any) -> tuple:
+    major, minor, direction = axes
+    return major, minor, direction[..., :, None] * direction[..., None, :]
+
+
+def _texture() -> list[Case]:
+    room, textures = "deferred.texture", _textures()
+    layer = np.array([0, 1, 0, 1, 0, 1, 7, -3], dtype=np.int32)
+    uv = 1.3 * _normal(8, 2)
+    lookup = {"textures": textures, "layer": layer, "uv": uv}
+    gradients = {"duv_dx": 0.3 * _normal(8, 2), "duv_dy": 0.1 * _normal(8, 2)}
+    steps = {"duv_dx": 0.3 * _normal(8, 2), "duv_dy": 0.3 * _normal(8, 2)}
+    # Nothing, thin, very thin, parallel, round, wide, absurd, infinite.
+    hard = {
+        "duv_dx": np.array([[0, 0], [1, 0], [0, 1], [0.3, 0.2], [0.1, 0], [9, 4], [1e30, -1e30], [np.inf, 0]]),
+        "duv_dy": np.array([[0, 0], [0, 0.02], [0, 0], [0.6, 0.4], [0, 0.05], [-5, 8], [0, 1e-30], [0, -np.inf]]),
+    }
+    filtered = {"textures": textures, "uv": uv, "layer": layer}
+    filters = (f"{room}.sample_texture_grad", f"{room}.sample_ewa")
+    free = ("uv", "duv_dx", "duv_dy")
+    y, x = np.mgrid[0:6, 0:8]
+    plane = np.stack([x + 0.3 * y, y - 0.2 * x], axis=-1) / (12.0 + x + 2.0 * y)[..., None]
+    plane[:, 4:, 0] -= 0.9
+    plane[3, 2] += 5.0
+    seams = np.where(x + y < 4, 0, np.where(x > 5, 2, 1)).astype(np.int32)
+    seams[4:, :2] = -1
+    bytes_and_light = (_rng.integers(0, 256, size=(6, 5, 4), dtype=np.uint8), _uniform(0, 3, 3, 4, 3))
+    return [
+        Case(f"{room}.mip_sizes", {"height": 5, "width": 37}, host=True),
+        Case(f"{room}.mip_chain", {"image": _uniform(0, 2, 13, 6, 4)}, gradients=("image",)),
+        *(
+            Case(f"{room}.build_textures", {"images": bytes_and_light, "wrap": wrap, "srgb": srgb}, f"srgb {srgb}")
+            for wrap, srgb in (("clamp", True), (("mirror", ("repeat", "clamp")), (False, True)))
+        ),
+        Case(
+            f"{room}.sample_bilinear",
+            {**lookup, "level": np.array([0, 0, 1, 1, 2, 2, 9, -1], dtype=np.int32)},
+            gradients=("uv",),
+        ),
+        Case(
+            f"{room}.sample_trilinear",
+            {**lookup, "lod": np.array([0.3, 1.7, 1.25, 2.5, 5.0, -1.0, 0.5, 0.9])},
+            gradients=("uv", "lod"),
+        ),
+        Case(f"{room}.texture_lod", {"textures": textures, "layer": layer, **steps}, gradients=free[1:]),
+        Case(f"{room}.texture_lod", {"textures": textures, "layer": layer, **hard}, "hard"),
+        Case(
+            f"{room}.footprint_axes",
+            {"dx": _normal(6, 2), "dy": _normal(6, 2)},
+            gradients=("dx", "dy"),
+            outcome=_axes_up_to_sign,
+        ),
+        *(Case(f, {**filtered, **gradients}, gradients=free, ulps32=LONG_SUM) for f in filters),
+        Case(filters[0], {**filtered, **hard}, "hard", ulps32=LONG_SUM),
+        Case(filters[1], {**filtered, **hard, "max_radius": 12}, "hard", ulps32=LONG_SUM),
+        Case(f"{room}.texture_derivatives", {"uv": plane, "layer": seams}, gradients=("uv",)),
+    ]
+
+
+def _quads() -> list[Case]:
+    room = "deferred.quads"
+    ids = np.sort(_rng.integers(0, 9, 21)).astype(np.int32)
+    mask = _rng.integers(0, 16, 21).astype(np.int32)
+    row, column = (_rng.integers(0, n, 21).astype(np.int32) for n in (3, 4))
+    pixels = np.array([0, 1, 1, 2, 3, 4, 9, 40, 400, 3000], np.int32)
+    touched = np.array([0, 1, 1, 2, 1, 3, 5, 18, 130, 800], np.int32)
+    values = _normal(5, 7, 2)
+    return [
+        *(
+            Case(f"{room}.{name}", {"values": values, "fine": fine}, f"fine {fine}", gradients=("values",))
+            for name in ("ddx", "ddy")
+            for fine in (True, False)
+        ),
+        Case(f"{room}.num_pixels", {"mask": mask}),
+        Case(f"{room}.quad_statistics", {"triangle_id": ids, "mask": mask, "num_triangles": 11}),
+        Case(f"{room}.helper_share", {"pixels": pixels, "quads": touched}),
+        Case(f"{room}.helper_share_by_size", {"pixels": pixels, "quads": touched, "num_sizes": 9}),
+        Case(f"{room}.quad_overdraw", {"row": row, "column": column, "rows": 4, "columns": 4}),
+    ]
+
+
+def _counts_of_warps(packed: Any) -> tuple:
+    return packed.quads, packed.pixels, packed.triangles
+
+
+def _warps() -> list[Case]:
+    room = "deferred.warps"
+    ids = np.sort(_rng.integers(0, 9, 21)).astype(np.int32)
+    mask = _rng.integers(0, 16, 21).astype(np.int32)
+    row, column = (_rng.integers(0, n, 21).astype(np.int32) for n in (3, 6))
+    trips = _uniform(0, 9, 5, 11)
+    taken = _rng.random((5, 11)) < 0.4
+    by_block = {"warp_size": 16, "order": "blocks"}
+    return [
+        Case(f"{room}.pack_quads", {"triangle_id": ids, "mask": mask}, outcome=_counts_of_warps),
+        Case(f"{room}.screen_lanes", {"values": trips}),
+        Case(f"{room}.screen_lanes", {"values": trips, **by_block}, "blocks"),
+        Case(f"{room}.quad_lanes", {"values": trips, "row": row, "column": column, "warp_size": 64}),
+        Case(f"{room}.covered_lanes", {"mask": mask}),
+        Case(f"{room}.loop_cost", {"trip_counts": _uniform(0, 9, 3, 8), "covered": _rng.random((3, 8)) < 0.7}),
+        Case(f"{room}.warp_cost", {"trip_counts": trips, **by_block}),
+        Case(f"{room}.branch_cost", {"taken": taken, "then_cost": 2.5, "warp_size": 8}),
+        Case(f"{room}.raster_owners", {"height": 7, "width": 9, "tile_size": 2}),
+        Case(f"{room}.raster_balance", {"work": trips, "num_rasters": 2, "tile_size": 2}),
+    ]
+
+
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
         _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility,
-        _pose_model, _skeleton, _skinning,
+        _pose_model, _skeleton, _skinning, _texture,
+        _quads, _warps,
     )
     for case in room()
 )  # fmt: skip

@@ -16,7 +16,10 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 
 # What of jaxrender has a partner in torchref: whole rooms, and single modules. The rest of `animation` builds
 # the data of the built-in body.
-PAIRED = ("vecmath", "harmonics.", "animation.skeleton", "animation.skinning")
+PAIRED = (
+    "vecmath", "harmonics.", "animation.skeleton", "animation.skinning",
+    "deferred.texture", "deferred.quads", "deferred.warps",
+)  # fmt: skip
 UNPAIRED_MODULES = {"harmonics.pipeline": "the order of the stages, no arithmetic"}
 
 # Public names without a partner, or with another signature.
@@ -32,6 +35,11 @@ EXCEPTIONS = {
     "harmonics.pose_model.model_arrays": "jaxrender writes and checks files; the twin only loads",
     "harmonics.pose_model.read_model_file": "the same",
     "harmonics.pose_model.model_hash": "the same",
+    "deferred.quads.Quads": "of jaxrender's screen triangles, which the twin's Fragments do not hold",
+    "deferred.quads.quad_coverage": "the same; judged by brute force in tests/deferred",
+    "deferred.quads.visible_quads": "the same",
+    "deferred.quads.visible_masks": "the same",
+    "deferred.quads.draw_overdraw": "a picture: metrics has no twin",
     "harmonics.sh.triple_product_tensor": "torchref's way to the product",
     "harmonics.zh.zonal_integral": "torchref integrates where jaxrender has closed forms",
 }
@@ -41,6 +49,7 @@ COMPARED_APART = {
     "harmonics.zh_fit.fit_zh_lobes": "the search of each side ends at its own digits: judged by error",
     "harmonics.zh_fit.fit_shared_axes": "the same",
     "harmonics.pose_model.load_pose_model": "reads a file",
+    "deferred.quads.quad_derivatives": "on fragments that each side rasterises: tests/twins/test_quads.py",
 }
 
 

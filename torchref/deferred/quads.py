@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchref._precision import in_float64
-from torchref.deferred.raster import Fragments
-from torchref.deferred.triangles import ScreenTriangles
+from torchref.deferred.interpolate import blend, weights_at
+from torchref.deferred.raster import Fragments, sample_places
 
 
 @in_float64
@@ -51,120 +51,23 @@ def quad_derivatives(
 ) -> tuple[Float[Tensor, "h w s c"], Float[Tensor, "h w s c"]]:
     """Differences over the quad of what each sample's own triangle has there, extrapolated; 0 where empty."""
     h, w, s = fragments.triangle_id.shape
-    m, offsets = fragments.samples.grid, fragments.samples.offsets
-    dx, dy = (attributes.new_zeros(h, w, s, attributes.shape[1]) for _ in range(2))
-    for i, j, k in torch.argwhere(fragments.triangle_id >= 0).tolist():
-        cell, offset = divmod(k, len(offsets))
-        row, column = i * m + cell // m, j * m + cell % m
-        top, left = row - row % 2, column - column % 2
-        base_row, base_column = (row, column) if fine else (top, left)
-
-        def at(r: int, c: int, i=i, j=j, k=k, offset=offset) -> Tensor:
-            x, y = (16 * n + 8 + o for n, o in zip((c, r), offsets[offset], strict=True))
-            return _value_at(fragments, attributes, (i, j, k), (16 * x, 16 * y), mode)
-
-        dx[i, j, k] = m * (at(base_row, left + 1) - at(base_row, left))
-        dy[i, j, k] = m * (at(top + 1, base_column) - at(top, base_column))
-    return dx, dy
-
-
-def _value_at(fragments: Fragments, attributes: Tensor, sample: tuple, place: tuple, mode: str) -> Tensor:
-    """An attribute of a sample's triangle at a place (x, y) in 1/256 px from the upper left corner of the image."""
-    h, w, _ = fragments.triangle_id.shape
-    m, triangles = fragments.samples.grid, fragments.triangles
-    source, own = int(fragments.triangle_id[sample]), int(fragments.screen_id[sample])
-    corners = attributes[fragments.faces[source].long()]
-    if mode in ("flat_first", "flat_last"):
-        return corners[0 if mode == "flat_first" else 2]
-    xy = triangles.xy[own].double() + torch.tensor([w * m * 128, h * m * 128])
-    # Screen weights from the three equations: they sum to 1 and blend the corners into the place.
-    equations = torch.cat([xy.T, torch.ones(1, 3, dtype=torch.float64)])
-    screen = torch.linalg.solve(equations, torch.tensor([*place, 1.0], dtype=torch.float64))
-    over_w = screen / triangles.w[own]
-    weights = (over_w / over_w.sum()) @ triangles.weights[own]
-    if mode == "noperspective":
-        # l_k is proportional to b_k w_k; the first rows are the triangles of the mesh, uncut.
-        weights = weights * (triangles.weights[source].T @ triangles.w[source])
-        weights = weights / weights.sum()
-    return weights @ corners
-
-
-@dataclass(frozen=True)
-class Quads:
-    """Quads of single triangles in the order of the API; `mask` holds the covered lanes as bits."""
-
-    triangle_id: Int[Tensor, " q"]
-    screen_id: Int[Tensor, " q"]
-    row: Int[Tensor, " q"]
-    column: Int[Tensor, " q"]
-    mask: Int[Tensor, " q"]
-    rows: int
-    columns: int
-
-
-def quad_coverage(fragments: Fragments) -> Quads:
-    """Every quad of which a triangle covers a pixel, in front or not: each pixel is tested against each triangle.
-
-    The quads of one triangle come row by row.
-    """
-    h, w, _ = fragments.triangle_id.shape
-    m, offsets, triangles = fragments.samples.grid, fragments.samples.offsets, fragments.triangles
-    h, w = h * m, w * m
-    found = []
-    for screen_id in triangles.order.tolist():
-        if not triangles.valid[screen_id]:
-            continue
-        masks: dict[tuple[int, int], int] = {}
-        for i in range(h):
-            for j in range(w):
-                places = [(256 * j + 128 + 16 * x - 128 * w, 256 * i + 128 + 16 * y - 128 * h) for x, y in offsets]
-                if any(_covers(triangles, screen_id, *place) for place in places):
-                    at = (i // 2, j // 2)
-                    masks[at] = masks.get(at, 0) | 1 << (i % 2 * 2 + j % 2)
-        source = int(triangles.source[screen_id])
-        found += [(source, screen_id, *at, mask) for at, mask in sorted(masks.items())]
-    columns = torch.tensor(found, dtype=torch.int32).reshape(-1, 5).T
-    return Quads(*columns, rows=(h + 1) // 2, columns=(w + 1) // 2)
-
-
-def _covers(triangles: ScreenTriangles, screen_id: int, x: int, y: int) -> bool:
-    """Whether a place lies in a triangle, by the top-left rule in exact integers, between the near and far plane."""
-    corners, inside, areas = triangles.xy[screen_id].tolist(), True, []
-    for k in range(3):
-        (px, py), (qx, qy) = corners[k], corners[(k + 1) % 3]
-        e = (qx - px) * (y - py) - (qy - py) * (x - px)
-        top_or_left = (py == qy and qx > px) or qy < py
-        inside = inside and (e > 0 or (e == 0 and top_or_left))
-        areas.append(e)
-    # The edge from corner k to k+1 faces corner k+2.
-    weights = [areas[(k + 1) % 3] / sum(areas) for k in range(3)]
-    z = sum(l * float(triangles.z[screen_id, k]) for k, l in enumerate(weights))
-    return inside and 0.0 <= z <= 1.0
-
-
-def visible_masks(fragments: Fragments, quads: Quads) -> Int[Tensor, " q"]:
-    """The masks without the lanes in which the triangle is nowhere visible."""
     m, per_cell = fragments.samples.grid, len(fragments.samples.offsets)
-    h, w, _ = fragments.triangle_id.shape
-    masks = []
-    for screen_id, row, column, mask in zip(quads.screen_id, quads.row, quads.column, quads.mask, strict=True):
-        left = 0
-        for lane in range(4):
-            i, j = 2 * int(row) + lane // 2, 2 * int(column) + lane % 2
-            if i < h * m and j < w * m and int(mask) >> lane & 1:
-                first = (i % m * m + j % m) * per_cell
-                seen = fragments.screen_id[i // m, j // m, first : first + per_cell] == screen_id
-                left |= int(seen.any()) << lane
-        masks.append(left)
-    return torch.tensor(masks, dtype=torch.int32)
+    places = sample_places(h, w, fragments.samples)
+    dx, dy = (attributes.new_zeros(h, w, s, attributes.shape[1]) for _ in range(2))
 
+    def at(sample: int, right: Tensor, down: Tensor) -> Tensor:
+        """The attribute of each pixel's own sample, so many cells to the right and down of it."""
+        x, y = places[..., 0] + 256 * right[..., None], places[..., 1] + 256 * down[..., None]
+        return blend(fragments, attributes, weights_at(fragments, x, y, mode=mode))[:, :, sample]
 
-def visible_quads(fragments: Fragments, quads: Quads) -> Quads:
-    """The quads that keep a lane when only visible lanes count."""
-    masks = visible_masks(fragments, quads)
-    kept = masks > 0
-    fields = (quads.triangle_id, quads.screen_id, quads.row, quads.column, masks)
-    return Quads(*(values[kept] for values in fields), rows=quads.rows, columns=quads.columns)
+    for k in range(s):
+        row = torch.arange(h)[:, None] * m + k // per_cell // m + torch.zeros(1, w, dtype=torch.int64)
+        column = torch.arange(w)[None] * m + k // per_cell % m + torch.zeros(h, 1, dtype=torch.int64)
+        to_top, to_left = -(row % 2), -(column % 2)
+        base_row, base_column = (0 * row, 0 * column) if fine else (to_top, to_left)
+        dx[:, :, k] = m * (at(k, to_left + 1, base_row) - at(k, to_left, base_row))
+        dy[:, :, k] = m * (at(k, base_column, to_top + 1) - at(k, base_column, to_top))
+    return dx, dy
 
 
 @dataclass(frozen=True)

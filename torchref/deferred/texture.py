@@ -176,7 +176,7 @@ def sample_texture_grad(
         ratio = major / minor
         if minor < 1.0:
             ratio = ratio * minor
-        count = max(1, math.ceil(float(ratio) - 1.0 / 256.0))
+        count = max(1, math.ceil(float(ratio.detach()) - 1.0 / 256.0))
         if count == 1:
             return _trilinear(textures, k, p, torch.log2(minor))
         # From the first tap to the last, such that with half a tap at either end the whole axis is covered.
@@ -247,8 +247,8 @@ def _line_derivatives(uv: Tensor, layer: list[int], tolerance: float) -> list[Te
     steps = {i: uv[i + 1] - uv[i] for i in range(len(layer) - 1) if layer[i] == layer[i + 1] and layer[i] >= 0}
 
     def jumps_from(i: int, other: int) -> bool:
-        size, change = (float(torch.linalg.vector_norm(v)) for v in (steps[other], steps[i] - steps[other]))
-        return change > tolerance * size and float(torch.linalg.vector_norm(steps[i])) > size
+        size, change = (float(torch.linalg.vector_norm(v.detach())) for v in (steps[other], steps[i] - steps[other]))
+        return change > tolerance * size and float(torch.linalg.vector_norm(steps[i].detach())) > size
 
     neighbours = {i: [o for o in (i - 1, i + 1) if o in steps] for i in steps}
     seams = {i for i in steps if neighbours[i] and all(jumps_from(i, o) for o in neighbours[i])}
@@ -304,7 +304,7 @@ def _place(textures: Textures, k: int, uv: Tensor, size: Tensor) -> Tensor:
 def _bilinear(textures: Textures, k: int, level: int, uv: Tensor) -> Tensor:
     level = min(max(int(level), 0), int(textures.num_levels[k]) - 1)
     place = _place(textures, k, uv, _size(textures, k, level))
-    left, top = (math.floor(x) for x in place.tolist())
+    left, top = (math.floor(x) for x in place.detach().tolist())
     total = torch.zeros(4, dtype=uv.dtype)
     for y in (top, top + 1):
         for x in (left, left + 1):
@@ -315,6 +315,6 @@ def _bilinear(textures: Textures, k: int, level: int, uv: Tensor) -> Tensor:
 
 def _trilinear(textures: Textures, k: int, uv: Tensor, lod: Tensor) -> Tensor:
     lod = torch.clamp(torch.nan_to_num(lod.double(), nan=0.0), 0, int(textures.num_levels[k]) - 1)
-    base = math.floor(float(lod))
+    base = math.floor(float(lod.detach()))
     tents = {l: 1.0 - torch.abs(lod - l) for l in (base, base + 1)}
     return sum(tent * _bilinear(textures, k, l, uv) for l, tent in tents.items())

@@ -1,0 +1,10 @@
+"""jaxrender.deferred.texture against the twin, kernel by kernel: values and derivatives."""
+
+import pytest
+
+from tests.twins.agreement import cases_of, check
+
+
+@pytest.mark.parametrize(("case", "dtype"), cases_of("deferred.texture."))
+def test_twin(case, dtype):
+    check(case, dtype)
