@@ -169,7 +169,7 @@ def refined_lobes(ground: Ground, num_lobes: int, *, offset: bool, track: Track)
 
     with ThreadPoolExecutor(num_cores()) as threads:
         solved = threads.map(solve, todo)
-        for own in track(iter(todo), len(todo), f"{num_lobes} lobes"):
+        for own in track(iter(todo), len(todo), count_lobes(num_lobes)):
             result[:, own] = next(solved)
     return result
 
@@ -180,13 +180,17 @@ def group_blocks(groups: Int[np.ndarray, " n"], size: int) -> list[Int[np.ndarra
     return [own[i : i + size] for own in owns for i in range(0, len(own), size)]
 
 
+def count_lobes(count: int) -> str:
+    return f"{count} lobe{'s' * (count > 1)}"
+
+
 def refined_label(num_lobes: int, offset: bool) -> str:
-    return f"{num_lobes} lobes, refined" + (" + offset" if offset else "")
+    return f"{count_lobes(num_lobes)}, refined" + (" + offset" if offset else "")
 
 
 def lobe_rows(ground: Ground, refined: dict[int, SH], axes: dict[int, np.ndarray]) -> Iterator[MethodRow]:
     for c in LOBE_COUNTS:
-        yield method_row(ground, f"{c} lobes, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
+        yield method_row(ground, f"{count_lobes(c)}, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
     for c in LOBE_COUNTS:
         yield method_row(ground, refined_label(c, ground.fit.offset), 6 * c, refined[c])
 
@@ -204,10 +208,10 @@ def subset_rows(
     yield method_row(ground, "linear, 16 SH", 16, ground.linear.predict(ground.sh))
     for c in track(iter(LOBE_COUNTS), len(LOBE_COUNTS), "fits per frame"):
         predicted, fitted = raw_angle_lobes(ground, c)
-        yield method_row(ground, f"{c} lobes, fit per frame, no pose model", 6 * c, fitted)
-        yield method_row(ground, f"{c} lobes, raw angles", 6 * c, predicted, note="as the paper prints it")
-        yield method_row(ground, f"{c} lobes, anchored charts", 6 * c, anchored_lobes(ground, axes[c]))
-        yield method_row(ground, f"{c} lobes, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
+        yield method_row(ground, f"{count_lobes(c)}, fit per frame, no pose model", 6 * c, fitted)
+        yield method_row(ground, f"{count_lobes(c)}, raw angles", 6 * c, predicted, note="as the paper prints it")
+        yield method_row(ground, f"{count_lobes(c)}, anchored charts", 6 * c, anchored_lobes(ground, axes[c]))
+        yield method_row(ground, f"{count_lobes(c)}, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
         for offset in (False, True):
             note = "trained on all frames"
             yield method_row(ground, refined_label(c, offset), 6 * c, refined[c, offset], note=note)

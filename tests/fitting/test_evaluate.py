@@ -152,7 +152,7 @@ def test_study_knows_better_from_worse(full):
     train = {row.method: row.sh["train"] for row in full.study.rows}
     assert train["baked, order 4"] == 0.0
     assert train["linear, 16 SH"] < train["mean visibility"] < train["unoccluded"]
-    assert train["3 lobes, axes fixed per point"] < train["1 lobes, axes fixed per point"]
+    assert train["3 lobes, axes fixed per point"] < train["1 lobe, axes fixed per point"]
     alone = {row.method: row.sh["train"] for row in full.study.subset_rows}
     fits = [alone[f"{c} lobes, fit per frame, no pose model"] for c in (1, 2, 3)]
     assert fits[0] > fits[1] > fits[2]
