@@ -107,14 +107,13 @@ def _study(report: Report, study: Study) -> None:
     report.table(
         _method_table(study.rows),
         caption=f"{len(study.points)} points, the same frames and ridge. SH: relative L2. sun, sky: relative RMS of "
-        "diffuse shading against untruncated truth, under directional lights and a sky.",
+        "diffuse shading under order-4 lamps and an order-4 sky, against the traced bits under the same lights.",
         best={name: kind for name, kind in best.items() if name in _method_table(study.rows)[0]},
     )
     if study.subset_rows:
         report.table(
             _method_table(study.subset_rows),
-            caption="Methods that fit lobes to every frame on its own, with others for comparison, on fewer points and "
-            "every second frame.",
+            caption="Methods that fit lobes to every frame on its own, with others for comparison, on fewer points.",
         )
     report.table([dataclasses.asdict(goal) for goal in study.goals], caption="Goals.")
     report.section("The paper's figures")

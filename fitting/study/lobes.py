@@ -180,6 +180,10 @@ def group_blocks(groups: Int[np.ndarray, " n"], size: int) -> list[Int[np.ndarra
     return [own[i : i + size] for own in owns for i in range(0, len(own), size)]
 
 
+def raw_label(num_lobes: int) -> str:
+    return f"{count_lobes(num_lobes)}, axes as θ, φ, fit per frame"
+
+
 def count_lobes(count: int) -> str:
     return f"{count} lobe{'s' * (count > 1)}"
 
@@ -201,7 +205,7 @@ def subset_rows(
     """From the paper's way to the refined model on the same few points and frames.
 
     Args:
-      refined: by number of lobes and offset; trained on all frames, given here for the ground's.
+      refined: by number of lobes and offset.
       axes: of each point, by number of lobes.
     """
     yield method_row(ground, "mean visibility", 0, np.broadcast_to(ground.sh[ground.train].mean(0), ground.sh.shape))
@@ -209,9 +213,8 @@ def subset_rows(
     for c in track(iter(LOBE_COUNTS), len(LOBE_COUNTS), "fits per frame"):
         predicted, fitted = raw_angle_lobes(ground, c)
         yield method_row(ground, f"{count_lobes(c)}, fit per frame, no pose model", 6 * c, fitted)
-        yield method_row(ground, f"{count_lobes(c)}, raw angles", 6 * c, predicted, note="as the paper prints it")
+        yield method_row(ground, raw_label(c), 6 * c, predicted, note="the paper's parameters, same pose features")
         yield method_row(ground, f"{count_lobes(c)}, anchored charts", 6 * c, anchored_lobes(ground, axes[c]))
         yield method_row(ground, f"{count_lobes(c)}, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
         for offset in (False, True):
-            note = "trained on all frames"
-            yield method_row(ground, refined_label(c, offset), 6 * c, refined[c, offset], note=note)
+            yield method_row(ground, refined_label(c, offset), 6 * c, refined[c, offset])

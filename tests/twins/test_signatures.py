@@ -16,7 +16,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 
 # What of jaxrender has a partner in torchref: whole rooms, and single modules. The rest of `animation` builds
 # the data of the built-in body.
-PAIRED = ("vecmath", "harmonics.", "animation.skeleton", "animation.skinning")
+PAIRED = ("vecmath", "camera", "metrics", "scene", "harmonics.", "animation.skeleton", "animation.skinning")
 UNPAIRED_MODULES = {"harmonics.pipeline": "the order of the stages, no arithmetic"}
 
 # Public names without a partner, or with another signature.
