@@ -253,9 +253,8 @@ def test_bad_characters_are_refused_in_one_line(character, tmp_path):
     with pytest.raises(InputError, match="active joints"):
         train_character(frozen, SMALL, tmp_path)
     # One channel of one joint: the matrix of joint angles has rank 1.
-    hinge = dataclasses.replace(
-        character, clips=(Clip("hinge", one_hinge(walk, articulating_joints(character)), 0.0, 1.0),)
-    )
+    keys = one_hinge(character.clips[0], articulating_joints(character))
+    hinge = dataclasses.replace(character, clips=(Clip("hinge", keys, 0.0, 1.0),))
     with pytest.raises(InputError, match="joint angles of rank 2 or more over the frames, got rank 1"):
         train_character(hinge, SMALL, tmp_path)
     assert not list(tmp_path.iterdir())
