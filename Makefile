@@ -18,7 +18,7 @@ demo: $(VENV)/.demo
 	$(BIN)/jaxrender demo
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check

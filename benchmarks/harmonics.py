@@ -269,10 +269,12 @@ def _linear_solve(sizes: Sizes, seed: int) -> Iterator[Measurement]:
 
 def _ridge_in_float64(features: np.ndarray, targets: np.ndarray, ridge: float) -> np.ndarray:
     """`fit_linear`'s weights by SVD."""
-    a = features - features.mean(axis=0)
+    scale = features.std(axis=0)
+    a = (features - features.mean(axis=0)) / scale
     u, s, vt = np.linalg.svd(a, full_matrices=False)
     lam = ridge * np.sum(a * a) / a.shape[1]
-    return (vt.T * (s / (s * s + lam))) @ (u.T @ (targets.astype(np.float64) - targets.mean(axis=0)))
+    scaled = (vt.T * (s / (s * s + lam))) @ (u.T @ (targets.astype(np.float64) - targets.mean(axis=0)))
+    return scaled / scale[:, None]
 
 
 def _training(sizes: Sizes, seed: int) -> Iterator[Measurement]:

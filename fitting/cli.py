@@ -1,10 +1,12 @@
 """python -m fitting train | evaluate | relight | inspect: parses, calls the stages, prints the paths."""
 
+import contextlib
 import dataclasses
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -17,15 +19,21 @@ from fitting.model import (
     find_model,
     model_header,
     save_pose_model,
+    source_file,
 )
 from jaxrender import cli as jaxrender_cli
 from jaxrender import console
 from jaxrender.animation.mannequin import builtin_character
 from jaxrender.animation.skinning import Character
-from jaxrender.checks import bad_input
+from jaxrender.checks import InputError, bad_input
+from jaxrender.harmonics.pose_model import PoseModel
 from jaxrender.io.atomic import write_bytes
 from jaxrender.io.character import load_character
 from jaxrender.machine import is_writable_folder
+
+if TYPE_CHECKING:
+    from fitting.evaluate import Evaluation
+    from fitting.train import TrainResult
 
 Out = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
 
@@ -44,7 +52,7 @@ class Train:
     split: SplitSettings = field(default_factory=SplitSettings)
     fit: FitSettings = field(default_factory=FitSettings)
     study: bool = True
-    """Whether to compare with the paper's methods and the baselines, on a sample of points: a minute or two."""
+    """Compare with the paper's methods and the baselines on a sample of points: a minute or two."""
     json: bool = False
     """Print one JSON object instead of the list of files."""
 
@@ -65,22 +73,16 @@ class Evaluate:
     model: tyro.conf.Positional[Path]
     """The folder of a training run."""
     study: bool = True
-    """Whether to compare with the paper's methods and the baselines, on a sample of points."""
+    """Compare with the paper's methods and the baselines on a sample of points."""
     json: bool = False
     """Print one JSON object instead of the list of files."""
 
     def run(self) -> None:
         console.enable_compilation_cache()
-        _, header, file = find_model(self.model)
-        settings = settings_from_header(header, file)
-        settings = dataclasses.replace(settings, fit=dataclasses.replace(settings.fit, ridge=header["ridge"]))
-        source = header["source"]
-        character = open_character(Path(source["input"]) if source["input"] else None, source["num_vertices"])
-        check_same_character(character, header, file)
-        train_and_report(
-            character, settings, file.parent, source=source["input"], num_vertices=source["num_vertices"],
-            study=self.study, as_json=self.json,
-        )  # fmt: skip
+        model, header, file, character = open_model(self.model)
+        evaluate_and_report(
+            character, model, header, settings_from_header(header, file), file, study=self.study, as_json=self.json
+        )
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def open_character(path: Path | None, num_vertices: int) -> Character:
     """The character of a file, or the built-in one; says what was repaired."""
+    if path is not None and path.is_dir():
+        bad_input(path, "input", expected="a glTF, GLB or BVH file", got="a folder")
     character = builtin_character(num_vertices=num_vertices) if path is None else load_character(
         path, num_vertices=num_vertices
     )  # fmt: skip
@@ -141,49 +145,118 @@ def settings_from_header(header: dict, file: Path) -> TrainSettings:
         bad_input(file, "settings", expected="the settings of a training run", got=str(error))
 
 
+def open_model(path: Path) -> tuple[PoseModel, dict, Path, Character]:
+    """A trained model, its header and file, and the character it was trained on."""
+    model, header, file = find_model(path)
+    character = open_character(source_file(header, file), header["source"]["num_vertices"])
+    check_same_character(character, model, header, file)
+    return model, header, file, character
+
+
 def train_and_report(
-    character: Character, settings: TrainSettings, out: Path, *, source, num_vertices: int, study: bool, as_json: bool
-) -> None:
+    character: Character, settings: TrainSettings, out: Path, *, source: Path | None, num_vertices: int, study: bool,
+    as_json: bool,
+) -> None:  # fmt: skip
     """The main job: bake, fit, evaluate, pictures, report. Everything heavy is imported here, after the cache is on."""
-    if not is_writable_folder(out):
-        bad_input("-o", str(out), expected="a folder that can be written", got="one that cannot")
-    from fitting.evaluate import evaluate
-    from fitting.pictures import draw_pictures
-    from fitting.report import write_report
+    _check_writable(out)
     from fitting.train import train_character
 
     console.announce_device(rays="Embree")
-
-    def track(items, count, label):
-        return console.track(items, label, total=count)
-
-    with console.keeping(f"the frames baked so far are in {out}; the same command continues"):
-        result = train_character(character, settings, out, track=track)
-        assert result.motion is not None  # a character always has one
-        if settings.fit.num_lobes and as_json is False:
+    with (
+        _named_by_file(character, source, out),
+        console.keeping(f"the frames baked so far are in {out}; the same command continues"),
+    ):
+        result = train_character(character, settings, out, track=_track)
+        if not as_json:
             console.announce(
                 f"ridge {result.ridge:g}; {result.bake.rays_per_second / 1e6:.1f} M rays/s; "
                 f"{int((~np.asarray(result.model.visible)).sum())} of {len(result.model.visible)} points see nothing"
             )
-        console.announce("evaluating ...")
-        with result.timings.stage("evaluate"):
-            evaluation = evaluate(
-                result.data, result.model, settings.fit, ridge=result.ridge, study=study, track=track,
-                angles=joint_angle_features(character, result.motion) if study else None,
-                clip_names=result.motion.clip_names,
-            )  # fmt: skip
-        found = character_source(character, Path(source) if source else None, num_vertices)
+        evaluation = _evaluate(character, result, settings, study=study)
+        found = character_source(character, source, num_vertices)
         header = model_header(result, settings, source=found, errors=evaluation.summary())
-        model_path, numbers_path = out / MODEL_FILE, out / "evaluation.json"
+        model_path = out / MODEL_FILE
         save_pose_model(model_path, result.model, header)
-        write_bytes(numbers_path, json.dumps(console.to_jsonable(evaluation.as_dict())).encode())
-        console.announce("drawing ...")
-        with result.timings.stage("pictures"):
-            pictures = draw_pictures(character, result.motion, result.model, evaluation, out)
-        report = write_report(out, result, settings, evaluation, model_path, pictures)
+        paths = _report(character, result, settings, evaluation, model_path)
     record = {"errors": header["errors"], "ridge": result.ridge, "seconds": result.timings.seconds}
-    paths = [model_path, numbers_path, *(path for path, _ in pictures), report]
-    console.finish(paths=paths, record=record, as_json=as_json)
+    console.finish(paths=[model_path, *paths], record=record, as_json=as_json)
+
+
+def evaluate_and_report(
+    character: Character, model: PoseModel, header: dict, settings: TrainSettings, file: Path, *, study: bool,
+    as_json: bool,
+) -> None:  # fmt: skip
+    """Measures the model in `file`, which stays as it is, on its own bake; what is missing of that is baked again."""
+    _check_writable(file.parent)
+    from fitting.dataset import BakeStatistics
+    from fitting.stages import Timings
+    from fitting.train import TrainResult
+    from fitting.training_data import bake_character
+
+    console.announce_device(rays="Embree")
+    data, _, motion = bake_character(character, settings, file.parent / "bake.zarr", track=_track)
+    if len(model.axes) != len(data.visible):
+        bad_input(file, "axes", expected=f"{len(data.visible)} points, as its settings make", got=len(model.axes))
+    seconds = dict(header["seconds"])
+    traced = BakeStatistics(header["rays"], float(seconds.get("bake", 0.0)), 0)
+    result = TrainResult(model, data, float(header["ridge"]), traced, Timings(seconds), motion)
+    evaluation = _evaluate(character, result, settings, study=study)
+    paths = _report(character, result, settings, evaluation, file)
+    console.finish(paths=paths, record={"errors": evaluation.summary()}, as_json=as_json)
+
+
+@contextlib.contextmanager
+def _named_by_file(character: Character, source: Path | None, out: Path) -> Iterator[None]:
+    """Bad input is reported with the file's name instead of the character's, and leaves no empty folder behind."""
+    try:
+        yield
+    except InputError as error:
+        with contextlib.suppress(OSError):
+            out.rmdir()
+        place, _, rest = str(error).partition(": ")
+        if source is None or place != character.name:
+            raise
+        raise InputError(f"{source}: {rest}") from error
+
+
+def _check_writable(out: Path) -> None:
+    if not is_writable_folder(out):
+        bad_input("-o", str(out), expected="a folder that can be written", got="one that cannot")
+
+
+def _track(items, count, label):
+    return console.track(items, label, total=count)
+
+
+def _evaluate(character: Character, result: "TrainResult", settings: TrainSettings, *, study: bool) -> "Evaluation":
+    from fitting.evaluate import evaluate
+
+    assert result.motion is not None  # a character always has one
+    console.announce("evaluating ...")
+    with result.timings.stage("evaluate"):
+        return evaluate(
+            result.data, result.model, settings.fit, ridge=result.ridge, study=study, track=_track,
+            angles=joint_angle_features(character, result.motion) if study else None,
+            clip_names=result.motion.clip_names,
+        )  # fmt: skip
+
+
+def _report(
+    character: Character, result: "TrainResult", settings: TrainSettings, evaluation: "Evaluation", model_path: Path
+) -> list[Path]:
+    """Numbers, pictures and the page, beside the model; their paths."""
+    from fitting.pictures import draw_pictures
+    from fitting.report import write_report
+
+    assert result.motion is not None
+    out = model_path.parent
+    numbers = out / "evaluation.json"
+    write_bytes(numbers, json.dumps(console.to_jsonable(evaluation.as_dict())).encode())
+    console.announce("drawing ...")
+    with result.timings.stage("pictures"):
+        pictures = draw_pictures(character, result.motion, result.model, evaluation, out)
+    report = write_report(out, result, settings, evaluation, model_path, pictures)
+    return [numbers, *(path for path, _ in pictures), report]
 
 
 def joint_angle_features(character: Character, motion):
@@ -217,9 +290,7 @@ def run_relight(options) -> None:
             console.announce(f"no model given: training the built-in character into {demo} first")
             run_demo(jaxrender_cli.Demo(out=demo, seed=options.seed))
         options = dataclasses.replace(options, model=demo)
-    model, header, file = find_model(options.model)
-    source = header["source"]
-    character = open_character(Path(source["input"]) if source["input"] else None, source["num_vertices"])
-    check_same_character(character, header, file)
+    model, _, file, character = open_model(options.model)
+    _check_writable(options.out)
     paths = render_clip(character, model, options)
     console.finish(paths=paths, record={"model": str(file)}, as_json=options.json)

@@ -28,6 +28,8 @@ class BakeSettings:
         check_at_least("frames_per_second", self.frames_per_second, 0.1)
         check_at_least("max_frames", self.max_frames, 2)
         check_at_least("num_directions", self.num_directions, 16)
+        if self.num_directions % 8:
+            raise ValueError(f"num_directions: expected a multiple of 8, got {self.num_directions}")
         check_at_least("num_mixed", self.num_mixed, 0)
         check_at_least("max_points", self.max_points, 0)
 
@@ -71,6 +73,7 @@ class FitSettings:
         check_one_of("num_lobes", self.num_lobes, (1, 2, 3))
         check_at_least("num_components", self.num_components, 1)
         check_at_least("refine_steps", self.refine_steps, 0)
+        check_at_least("mixed_weight", self.mixed_weight, 0.0)
         check_one_of("features", self.features, ("surroundings", "exponential_map", "euler"))
         if self.ridge is not None:
             check_at_least("ridge", self.ridge, 0.0)

@@ -1,12 +1,13 @@
 """What a model is trained on: shading points, poses and their baked visibility, in a resumable store on disk.
 
-The store is a zarr group with one chunk per frame. A frame is written whole, then its flag; an interrupted bake
-continues with the frames whose flag is missing and ends with the same bytes.
+The store is a zarr group with one chunk per frame. A frame is written whole, then its checksum; an interrupted bake
+continues with the frames whose checksum is missing or wrong and ends with the same bytes.
 """
 
 import json
 import shutil
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 import zarr
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
 from fitting.config import BakeSettings
@@ -23,10 +24,11 @@ from fitting.motion import Motion
 from jaxrender.animation.skeleton import global_matrices
 from jaxrender.animation.skinning import Character, skin_mesh
 from jaxrender.checks import bad_input, check_finite
+from jaxrender.console import announce
 from jaxrender.harmonics.visibility import hemisphere_directions, trace_visibility
 from jaxrender.scene import MeshSequence
 
-STORE_VERSION = 1
+STORE_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -51,16 +53,33 @@ def choose_points(character: Character, max_points: int, *, seed: int = 0) -> Sh
     if max_points == 0 or len(first) <= max_points:
         return points
     at = np.asarray(skin.vertices, np.float64)
-    normals = np.asarray(skin.normals, np.float64)
     corners = at[character.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     share = np.bincount(of_vertex.reshape(-1)[character.faces.reshape(-1)], np.repeat(area, 3), len(first)) + 1e-12
     rng = np.random.default_rng(seed)
     kept = np.sort(rng.choice(len(first), max_points, replace=False, p=share / share.sum()))
-    size = np.ptp(at, axis=0).max()
-    key = np.concatenate([at / size, 0.05 * normals], axis=1)
-    nearest = cKDTree(key[first[kept]]).query(key)[1]
-    return ShadingPoints(first[kept], nearest)
+    return ShadingPoints(first[kept], nearest_points(character, first[kept]))
+
+
+def nearest_points(character: Character, vertices: Int[np.ndarray, " n"]) -> Int[np.ndarray, " v"]:
+    """For every vertex which of some vertices is most like it: near, of like normal, and moved by the same joints."""
+    skin = character.skin
+    at, normals = np.asarray(skin.vertices, np.float64), np.asarray(skin.normals, np.float64)
+    joints = np.zeros((len(at), len(character.skeleton.parents)))
+    palette = np.asarray(skin.palette_joints)[np.asarray(skin.joint_indices)]
+    np.add.at(joints, (np.arange(len(at))[:, None], palette), np.asarray(skin.weights, np.float64))
+    size = np.ptp(at, axis=0).max() or 1.0
+    key = np.concatenate([at / size, 0.05 * normals, 0.05 * joints], axis=1)
+    return cKDTree(key[vertices]).query(key)[1]
+
+
+def represent_by_visible(character: Character, points: ShadingPoints, visible: Bool[np.ndarray, " p"]) -> ShadingPoints:
+    """No vertex is left to a point that sees nothing, unless it is that point itself."""
+    seen = np.flatnonzero(visible)
+    nearest = seen[nearest_points(character, points.vertices[seen])]
+    chosen = np.where(visible[points.of_vertex], points.of_vertex, nearest)
+    chosen[points.vertices] = np.arange(len(points.vertices))
+    return ShadingPoints(points.vertices, chosen)
 
 
 PosedMesh = tuple[np.ndarray, np.ndarray]
@@ -113,28 +132,56 @@ class VisibilityStore:
         if not self.resumed:
             if path.exists() and not (path / "zarr.json").is_file():
                 bad_input(path, "store", expected="nothing or a visibility store", got="something else")
+            if existing:
+                announce(f"{path} holds a bake of other settings or another character; it is made anew")
             shutil.rmtree(path, ignore_errors=True)
             group = zarr.create_group(path)
             bytes_per_point = -(-bake.num_directions // 8)
             shape = (num_frames, num_points, bytes_per_point)
             group.create_array("visibility", shape=shape, chunks=(1, *shape[1:]), dtype="uint8")
-            group.create_array("done", shape=(num_frames,), chunks=(1,), dtype="uint8", fill_value=0)
+            group.create_array("checksum", shape=(num_frames,), chunks=(1,), dtype="uint64", fill_value=0)
             # The header comes last: a store without it is taken for unfinished and made anew.
             group.attrs.update(header)
         self._visibility = zarr.open_array(path / "visibility", mode="r+")
-        self._done = zarr.open_array(path / "done", mode="r+")
+        self._checksum = zarr.open_array(path / "checksum", mode="r+")
 
     def missing(self) -> Int[np.ndarray, " n"]:
-        """Frames not baked yet."""
-        return np.flatnonzero(np.asarray(self._done[:]) == 0)
+        """Frames not baked yet, and those that are not on disk as they were written."""
+        return np.flatnonzero([self._frame(index) is None for index in range(self.num_frames)])
 
     def write(self, frame: int, bits: UInt8[np.ndarray, "p bytes"]) -> None:
-        self._visibility[frame] = bits
-        self._done[frame] = 1
+        try:
+            self._visibility[frame] = bits
+            self._checksum[frame] = _checksum(bits)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def read(self) -> UInt8[np.ndarray, "f p bytes"]:
-        """All frames; a bit per ray, so 10,000 points x 300 frames x 256 directions are 96 MB."""
-        return np.asarray(self._visibility[:])
+        """All frames; a bit per ray, so 10,000 points x 300 frames x 256 directions are 96 MB.
+
+        Raises:
+          InputError: if a frame is missing or damaged.
+        """
+        bits = np.empty(self._visibility.shape, np.uint8)
+        for index in range(self.num_frames):
+            frame = self._frame(index)
+            if frame is None:
+                bad_input(self.path, f"frame {index}", expected="visibility as it was baked", got="none, or damaged")
+            bits[index] = frame
+        return bits
+
+    def _frame(self, index: int) -> UInt8[np.ndarray, "p bytes"] | None:
+        try:
+            expected = int(np.asarray(self._checksum[index]))
+            bits = np.asarray(self._visibility[index]) if expected else None
+        except (OSError, RuntimeError, ValueError):
+            return None
+        return bits if bits is not None and _checksum(bits) == expected else None
+
+
+def _checksum(bits: UInt8[np.ndarray, "p bytes"]) -> int:
+    """Never 0, which stands for a frame that is not there."""
+    return 1 << 32 | zlib.crc32(np.ascontiguousarray(bits).data)
 
 
 def _read_header(path: Path) -> dict | None:

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import NoneType
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,6 +40,8 @@ def model_header(result: TrainResult, settings: TrainSettings, *, source: dict, 
         "source": source,
         "settings": settings.as_dict(),
         "ridge": result.ridge,
+        "seconds": dict(result.timings.seconds),
+        "rays": result.bake.num_rays,
         "invisible_points": int((~np.asarray(model.visible)).sum()),
         "errors": errors,
     }
@@ -48,7 +52,7 @@ def character_source(character: Character, input_path: Path | None, num_vertices
     return {
         "name": character.name,
         "content_hash": character.content_hash,
-        "input": str(input_path) if input_path else None,
+        "input": str(input_path.resolve()) if input_path else None,
         "num_vertices": num_vertices,
     }
 
@@ -70,12 +74,57 @@ def find_model(path: Path) -> tuple[PoseModel, dict, Path]:
     if not file.is_file():
         bad_input(path, "model", expected=f"a model file, or a folder with {MODEL_FILE}", got="none there")
     model, header = load_pose_model(file)
+    _check_header(file, header)
     return model, header, file
 
 
-def check_same_character(character: Character, header: dict, path: Path) -> None:
+# Field of the header -> the types it may have.
+_HEADER: dict[str, tuple[type, ...]] = {
+    "source.name": (str,),
+    "source.content_hash": (str,),
+    "source.input": (str, NoneType),
+    "source.num_vertices": (int,),
+    "ridge": (int, float),
+    "seconds": (dict,),
+    "rays": (int,),
+}
+
+
+def _check_header(file: Path, header: dict) -> None:
+    for field, types in _HEADER.items():
+        value: Any = header
+        for key in field.split("."):
+            value = value.get(key, ...) if isinstance(value, dict) else ...
+        if not isinstance(value, types) or isinstance(value, bool):
+            words = " or ".join("null" if kind is NoneType else kind.__name__ for kind in types)
+            bad_input(file, field, expected=words, got="nothing" if value is ... else repr(value)[:60])
+
+
+def source_file(header: dict, model_file: Path) -> Path | None:
+    """The file a model was trained on, where it was or beside the model; None for the built-in character.
+
+    Raises:
+      InputError: if it is in neither place.
+    """
+    name = header["source"]["input"]
+    if name is None:
+        return None
+    found = [place for place in (Path(name), model_file.parent / Path(name).name) if place.is_file()]
+    if not found:
+        bad_input(model_file, "source.input", expected=f"{name}, or a file of that name beside the model", got="none")
+    return found[0]
+
+
+def check_same_character(character: Character, model: PoseModel, header: dict, path: Path) -> None:
     """Raises InputError unless the model was trained on this character."""
-    expected = header.get("source", {}).get("content_hash")
+    expected = header["source"]["content_hash"]
     if expected != character.content_hash:
-        got = f"{character.name}, {character.content_hash[:12]}"
-        bad_input(path, "character", expected=f"the character of hash {str(expected)[:12]}", got=got)
+        other = f"{character.name}, {character.content_hash[:12]}"
+        bad_input(path, "character", expected=f"the character of hash {expected[:12]}", got=other)
+    num_joints, num_vertices = len(character.skeleton.parents), len(character.albedo)
+    for name, indices in (("joints", model.features.joints), ("bones", model.features.bones)):
+        if len(indices) and int(np.max(indices)) >= num_joints:
+            got = int(np.max(indices))
+            bad_input(path, f"features.{name}", expected=f"indices below {num_joints}, the joints", got=got)
+    if len(model.points) != num_vertices:
+        bad_input(path, "points", expected=f"{num_vertices} entries, one a vertex", got=len(model.points))

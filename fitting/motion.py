@@ -13,7 +13,7 @@ from jaxrender.animation.skinning import Character
 from jaxrender.checks import bad_input
 
 TRAIN, SEGMENT, CLIP, MIXED = 0, 1, 2, 3
-PART_NAMES = ("training frames", "held-out segments", "held-out clips", "mixed poses")
+PART_NAMES = ("training", "held-out segments", "held-out clips", "mixed poses")
 
 
 @dataclass(frozen=True)

@@ -195,15 +195,15 @@ def draw_pictures(
     scale = "(white: a quarter of the bright tone)"
     pictures = [
         (still.comparison(out / "key_light.png", "diffuse", lamp),
-         f"Diffuse under one lamp from the upper left ({where}, {held}): without shadows, the model, traced truth, "
-         f"and the difference {scale}."),
+         f"Diffuse under one lamp of order 4 from the upper left ({where}, {held}): without shadows, the model, traced "
+         f"visibility under the same light, and the difference {scale}."),
         (still.comparison(out / "diffuse.png", "diffuse", sky), "Diffuse under the built-in sky."),
         (still.comparison(out / "phong.png", "phong", sky, exponent=12.0), "Phong, exponent 12, local viewer."),
         (still.comparison(out / "membrane.png", "membrane", turn_light(sky, 2.4)),
          "Thin membrane, lit from behind: front light is shadowed, back light is not, as in the paper."),
         (still.painted(out / "error_on_mesh.png", evaluation.point_errors),
          f"RMS relative SH error of each point over {evaluation.painted_on}, from the front and from behind; pale "
-         "yellow is 0.5 and more, dark is 0."),
+         "yellow is 0.5 and more, dark is 0, grey sees nothing and was not measured."),
     ]  # fmt: skip
     film, sweep = out / "film.webp", out / "membrane.webp"
     poses = pose_at_frames(character, 0, fps=12.0, max_frames=36)
@@ -261,12 +261,14 @@ class Still:
 
     def painted(self, path: Path, point_errors: Float[np.ndarray, " p"], *, high: float = 0.5) -> Path:
         """A number per point painted on the mesh, from the front and from behind."""
-        values = np.nan_to_num(point_errors)[np.asarray(self.model.points)][:, None] / high
+        of_vertex = point_errors[np.asarray(self.model.points)]
+        measured = np.isfinite(of_vertex)
+        values = np.stack([np.where(measured, of_vertex / high, 0.0), measured], axis=-1)
         back = make_still(
             self.character, self.model, self.pose, size=len(self.surface.triangle) // self.surface.samples_per_axis,
             azimuth_degrees=205.0, num_directions=0,
         )  # fmt: skip
-        images = [still._shown(values, _heat) for still in (self, back)]
+        images = [still._shown(values, _heat_where_measured) for still in (self, back)]
         write_png(path, side_by_side(images, ["front", "back"]))
         return path
 
@@ -310,6 +312,12 @@ def make_still(
 
 def _heat(image: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 3"]:
     return np.asarray(heatmap(jnp.asarray(image[..., 0], jnp.float32), high=1.0))
+
+
+def _heat_where_measured(image: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w 3"]:
+    """Channel 0 as heat where channel 1, the share of measured corners, is above a half; grey elsewhere."""
+    value = image[..., :1] / np.maximum(image[..., 1:], 1e-6)
+    return np.where(image[..., 1:] > 0.5, _heat(value), 0.2)
 
 
 # --- Clips

@@ -10,6 +10,7 @@ from fitting.config import TrainSettings
 from fitting.evaluate import Evaluation
 from fitting.motion import PART_NAMES
 from fitting.study import Study
+from fitting.study.lobes import count_lobes
 from fitting.train import TrainResult
 from jaxrender import console
 from jaxrender.io.report import Report
@@ -45,8 +46,8 @@ def write_report(
 
 def _subtitle(result: TrainResult, evaluation: Evaluation) -> str:
     counts = [(PART_NAMES[part], int((result.data.part == part).sum())) for part in range(4)]
-    frames = ", ".join(f"{count} {name}" for name, count in counts if count)
-    return f"{evaluation.num_points} shading points, {result.model.num_lobes} lobes; {frames}"
+    frames = ", ".join(f"{count} of {name}" for name, count in counts if count)
+    return f"{evaluation.num_points} shading points, {count_lobes(result.model.num_lobes)}; frames: {frames}"
 
 
 def _summary(report: Report, result: TrainResult, evaluation: Evaluation, model_path: Path) -> None:
@@ -61,7 +62,7 @@ def _summary(report: Report, result: TrainResult, evaluation: Evaluation, model_
         "ridge": result.ridge,
         "model file": console.format_bytes(model_path.stat().st_size),
         "pose matrices": f"{console.format_bytes(weights.nbytes)} as {weights.dtype}",
-        "pose components": weights.shape[1] - 1,
+        "pose components": len(weights) - 1,
         "traced": f"{result.bake.num_rays / 1e6:.0f} M rays at {result.bake.rays_per_second / 1e6:.1f} M per second",
     }
     report.facts({name: "-" if value is None else value for name, value in facts.items()})
@@ -106,14 +107,13 @@ def _study(report: Report, study: Study) -> None:
     report.table(
         _method_table(study.rows),
         caption=f"{len(study.points)} points, the same frames and ridge. SH: relative L2. sun, sky: relative RMS of "
-        "diffuse shading against untruncated truth, under directional lights and a sky.",
+        "diffuse shading under order-4 lamps and an order-4 sky, against the traced bits under the same lights.",
         best={name: kind for name, kind in best.items() if name in _method_table(study.rows)[0]},
     )
     if study.subset_rows:
         report.table(
             _method_table(study.subset_rows),
-            caption="Methods that fit lobes to every frame on its own, with others for comparison, on fewer points and "
-            "every second frame.",
+            caption="Methods that fit lobes to every frame on its own, with others for comparison, on fewer points.",
         )
     report.table([dataclasses.asdict(goal) for goal in study.goals], caption="Goals.")
     report.section("The paper's figures")

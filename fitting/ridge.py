@@ -6,7 +6,7 @@ from jaxtyping import Bool, Int
 from fitting.config import FitSettings
 from fitting.features import fit_basis
 from fitting.motion import TRAIN
-from fitting.training_data import TrainingData
+from fitting.training_data import TrainingData, project
 
 RIDGES = tuple(10.0 ** (-0.5 * i) for i in range(8, -1, -1))
 
@@ -23,7 +23,7 @@ def choose_ridge(data: TrainingData, fit: FitSettings, *, max_points: int = 1200
     folds = held_out_folds(data)
     if not folds:
         return RIDGES[len(RIDGES) // 2]
-    sh = data.sh(points)
+    sh = project(data.bits, points, data.table)
     scores = np.zeros((len(folds), len(RIDGES)))
     totals = np.zeros(len(folds))
     basis, _ = fit_basis(data.basis, data.raw, weights, fit.num_components)
@@ -31,9 +31,7 @@ def choose_ridge(data: TrainingData, fit: FitSettings, *, max_points: int = 1200
         own = sh[:, data.groups[points] == g].reshape(len(sh), -1).astype(np.float64)
         a = (data.raw[:, g] - np.asarray(basis.mean)[g]) @ np.asarray(basis.basis)[g].astype(np.float64)
         for i, left_out in enumerate(folds):
-            # A mixed pose with a limb of a left-out frame would give it away.
-            hidden = left_out if data.source is None else left_out[data.source].any(axis=1)
-            w = np.where(hidden, 0.0, weights)
+            w = np.where(touched_by(data, left_out), 0.0, weights)
             mean_a, mean_b = w @ a / w.sum(), w @ own / w.sum()
             centred, rest = a - mean_a, own - mean_b
             gram, moment = centred.T @ (w[:, None] * centred), centred.T @ (w[:, None] * rest)
@@ -57,6 +55,11 @@ def held_out_folds(data: TrainingData) -> list[Bool[np.ndarray, " f"]]:
         tail[frames[int(np.ceil(0.8 * len(frames))) :]] = True
     whole = [train & (data.clip == c) for c in clips[:: max(1, len(clips) // 4)][:4]] if len(clips) >= 3 else []
     return ([tail] if tail.any() else []) + whole
+
+
+def touched_by(data: TrainingData, left_out: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """The frames left out, and the mixed poses with a limb of one of them, which would give it away."""
+    return left_out if data.source is None else left_out[data.source].any(axis=1)
 
 
 def some_points(data: TrainingData, count: int) -> Int[np.ndarray, " n"]:

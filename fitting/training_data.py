@@ -19,6 +19,7 @@ from fitting.dataset import (
     character_frames,
     choose_points,
     mean_visibility,
+    represent_by_visible,
     sequence_frames,
 )
 from fitting.features import all_raw_features, feature_groups, unfitted_basis
@@ -87,6 +88,7 @@ def bake_character(
     motion = sample_motion(character, settings.bake, settings.split)
     points = choose_points(character, settings.bake.max_points, seed=settings.bake.seed)
     bones, groups = feature_groups(character, points.vertices, settings.fit.features)
+    check_pose_rank(character, motion)
     basis = unfitted_basis(character, motion, settings.fit.features, bones)
     raw = all_raw_features(basis, character, motion)
     frames = character_frames(character, motion)
@@ -96,7 +98,25 @@ def bake_character(
         character.name, frames, character.faces, points, groups, raw, basis, motion.part, motion.clip,
         source, settings, store, track,
     )  # fmt: skip
-    return dataclasses.replace(data, source=motion.source), statistics, motion
+    if settings.bake.max_points:
+        points = represent_by_visible(character, points, data.visible)
+    return dataclasses.replace(data, points=points, source=motion.source), statistics, motion
+
+
+def check_pose_rank(character: Character, motion: Motion) -> int:
+    """Rank of the matrix of joint angles over the training frames.
+
+    Raises:
+      InputError: if it is below 2. A single motion of a single joint teaches nothing about any other pose.
+    """
+    angles = unfitted_basis(character, motion, "exponential_map", np.zeros(1, np.int32))
+    rows = all_raw_features(angles, character, motion)[motion.part == TRAIN, 0].astype(np.float64)
+    rank = int(np.linalg.matrix_rank(rows - rows.mean(axis=0), tol=1e-4 * np.sqrt(rows.size)))
+    if rank < 2:
+        bad_input(
+            character.name, "poses", expected="joint angles of rank 2 or more over the frames", got=f"rank {rank}"
+        )
+    return rank
 
 
 def bake_sequence(

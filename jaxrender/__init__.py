@@ -11,7 +11,8 @@ Conventions, the same everywhere (docs/conventions.md has the reasons):
 - Arrays first, then `*`, then options. Pointwise kernels take any leading axes; `jit` and `vmap` are the caller's.
 
 The rooms are subpackages: `jaxrender.io` (files), `jaxrender.animation` (skeletons, skinning, the built-in body),
-`jaxrender.harmonics` (visibility, lobes, relighting), `jaxrender.pathtrace` (the CPU ray backend).
+`jaxrender.deferred` (rasteriser, quads, textures, G-buffer, shading), `jaxrender.harmonics` (visibility, lobes,
+relighting), `jaxrender.pathtrace` (the CPU ray backend).
 """
 
 from jaxrender.camera import Camera as Camera

@@ -3,6 +3,7 @@
 A message names the argument (or the file and the field), the rule, and what came.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -34,8 +35,8 @@ def check_same_shape(names: str, a, b) -> None:
 
 
 def check_at_least(name: str, value: int | float, smallest: int | float) -> None:
-    """Raises ValueError unless `value` >= `smallest`."""
-    if not value >= smallest:
+    """Raises ValueError unless `value` is finite and >= `smallest`."""
+    if not smallest <= value < math.inf:
         raise ValueError(f"{name}: expected a value >= {smallest}, got {value}")
 
 

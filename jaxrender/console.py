@@ -38,7 +38,7 @@ def parse(commands: Any, *, prog: str, description: str = "", argv: list[str] | 
 
     Field docstrings are the help texts. A usage error is told on standard error and exits with status 2.
     """
-    markers = (tyro.conf.FlagCreatePairsOff, tyro.conf.PositionalMetavarFromFieldName)
+    markers = (tyro.conf.PositionalMetavarFromFieldName,)
     return tyro.cli(commands, prog=prog, description=description or None, args=argv, config=markers)
 
 

@@ -30,6 +30,13 @@ PROMISED = {
         "relight": None,
         "membrane": None,
     },
+    "jaxrender.deferred": {
+        "rasterize": ("clip", "faces", "*", "height", "width", "samples", "cull"),
+        "interpolate": ("fragments", "attributes", "*", "mode"),
+        "ddx": ("values", "*", "fine"),
+        "ddy": ("values", "*", "fine"),
+        "sample_texture_grad": ("textures", "uv", "duv_dx", "duv_dy", "*", "max_anisotropy"),
+    },
     "jaxrender.io": {
         "load_scene": ("path",),
         "load_character": ("path",),

@@ -3,7 +3,7 @@
 from fitting.errors import NORM_FLOOR, SH, by_part, sum_errors
 from fitting.motion import MIXED
 from fitting.study.ground import Ground, cosine_floor, diffuse_operator
-from fitting.study.lobes import LOBE_COUNTS
+from fitting.study.lobes import LOBE_COUNTS, refined_label
 
 
 def series(name: str, target: str, norm: str, predicted: SH, truth: SH, part, *, floor: float) -> dict:
@@ -33,11 +33,13 @@ def figure3(ground: Ground, plain: SH) -> list[dict]:
     ]
 
 
-def figure5(ground: Ground, refined: dict) -> list[dict]:
-    """One lobe against two and three (the paper's figure 5), refined as the model's settings say."""
+def figure5(ground: Ground, refined: dict[tuple[int, bool], SH]) -> list[dict]:
+    """One lobe against two and three (the paper's figure 5), jointly refined, without and with the constant offset."""
     norm, part = f"max(|v|, {NORM_FLOOR})", ground.data.part
-    named = {f"{c} lobe{'s' * (c > 1)}": refined[c] for c in LOBE_COUNTS}
     return [
-        series(name, "order-4 visibility", norm, predicted, ground.sh, part, floor=NORM_FLOOR)
-        for name, predicted in named.items()
+        series(
+            refined_label(c, offset), "order-4 visibility", norm, refined[c, offset], ground.sh, part, floor=NORM_FLOOR
+        )
+        for offset in (False, True)
+        for c in LOBE_COUNTS
     ]

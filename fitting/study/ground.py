@@ -107,19 +107,14 @@ def make_ground(data: TrainingData, fit: FitSettings, ridge: float) -> Ground:
     return Ground(data, fit, linear_pose(data, fit, ridge), both[..., :16].copy(), both[..., 16:].copy())
 
 
-def thin(data: TrainingData, points: Int[np.ndarray, " n"], step: int = 1) -> TrainingData:
-    """Some points of the data, in every `step`-th frame."""
-    frames = slice(None, None, step)
+def thin(data: TrainingData, points: Int[np.ndarray, " n"]) -> TrainingData:
+    """Some points of the data."""
     return dataclasses.replace(
         data,
         points=ShadingPoints(data.points.vertices[points], np.arange(len(points))),
         groups=data.groups[points],
-        bits=data.bits[frames][:, points],
-        raw=data.raw[frames],
-        part=data.part[frames],
-        clip=data.clip[frames],
+        bits=data.bits[:, points],
         visible=data.visible[points],
-        source=data.source if step == 1 else None,  # it counts frames, all of them
     )
 
 

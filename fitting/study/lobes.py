@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -14,7 +14,7 @@ from fitting.errors import SH
 from fitting.fit import fit_block, predict_block
 from fitting.solve import ORDER, lobe_targets, synthesize
 from fitting.stages import Track
-from fitting.study.ground import Ground, MethodRow, method_row
+from fitting.study.ground import Ground, LinearPose, MethodRow, method_row
 from jaxrender.harmonics.pose_model import lobes_from_numbers
 from jaxrender.harmonics.zh import lobes_to_sh
 from jaxrender.harmonics.zh_fit import spread_start_axes
@@ -127,11 +127,11 @@ def free_fits(sh: Float[np.ndarray, "n 16"], num_lobes: int) -> Float[np.ndarray
     return in_blocks(block, sh)
 
 
-def raw_angle_lobes(ground: Ground, num_lobes: int) -> tuple[SH, SH]:
-    """Each frame fitted on its own; θ, φ and coefficients linear in pose. Also the fits themselves."""
+def raw_angle_lobes(ground: Ground, num_lobes: int, poses: Sequence[LinearPose]) -> tuple[SH, list[SH]]:
+    """Each frame fitted on its own, and its θ, φ and coefficients made linear in each kind of pose features."""
     f, n, k = ground.sh.shape
     numbers = free_fits(ground.sh.reshape(f * n, k), num_lobes).reshape(f, n, -1)
-    return np.asarray(_from_angles(ground.linear.predict(numbers))), np.asarray(_from_angles(numbers))
+    return np.asarray(_from_angles(numbers)), [np.asarray(_from_angles(pose.predict(numbers))) for pose in poses]
 
 
 def anchored_lobes(ground: Ground, axes: Float[np.ndarray, "n c 3"]) -> SH:
@@ -169,7 +169,7 @@ def refined_lobes(ground: Ground, num_lobes: int, *, offset: bool, track: Track)
 
     with ThreadPoolExecutor(num_cores()) as threads:
         solved = threads.map(solve, todo)
-        for own in track(iter(todo), len(todo), f"{num_lobes} lobes"):
+        for own in track(iter(todo), len(todo), count_lobes(num_lobes)):
             result[:, own] = next(solved)
     return result
 
@@ -180,34 +180,52 @@ def group_blocks(groups: Int[np.ndarray, " n"], size: int) -> list[Int[np.ndarra
     return [own[i : i + size] for own in owns for i in range(0, len(own), size)]
 
 
+def raw_label(num_lobes: int) -> str:
+    return f"{count_lobes(num_lobes)}, axes as θ, φ, fit per frame"
+
+
+def paper_label(num_lobes: int) -> str:
+    return f"{count_lobes(num_lobes)}, axes as θ, φ, fit per frame, joint angles: the paper's way"
+
+
+def count_lobes(count: int) -> str:
+    return f"{count} lobe{'s' * (count > 1)}"
+
+
 def refined_label(num_lobes: int, offset: bool) -> str:
-    return f"{num_lobes} lobes, refined" + (" + offset" if offset else "")
+    return f"{count_lobes(num_lobes)}, refined" + (" + offset" if offset else "")
 
 
 def lobe_rows(ground: Ground, refined: dict[int, SH], axes: dict[int, np.ndarray]) -> Iterator[MethodRow]:
     for c in LOBE_COUNTS:
-        yield method_row(ground, f"{c} lobes, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
+        yield method_row(ground, f"{count_lobes(c)}, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
     for c in LOBE_COUNTS:
         yield method_row(ground, refined_label(c, ground.fit.offset), 6 * c, refined[c])
 
 
 def subset_rows(
-    ground: Ground, refined: dict[tuple[int, bool], SH], axes: dict[int, np.ndarray], track: Track
+    ground: Ground,
+    refined: dict[tuple[int, bool], SH],
+    axes: dict[int, np.ndarray],
+    joint_angles: LinearPose | None,
+    track: Track,
 ) -> Iterator[MethodRow]:
     """From the paper's way to the refined model on the same few points and frames.
 
     Args:
-      refined: by number of lobes and offset; trained on all frames, given here for the ground's.
+      joint_angles: the same frames seen through joint angles, as the paper sees them.
+      refined: by number of lobes and offset.
       axes: of each point, by number of lobes.
     """
     yield method_row(ground, "mean visibility", 0, np.broadcast_to(ground.sh[ground.train].mean(0), ground.sh.shape))
     yield method_row(ground, "linear, 16 SH", 16, ground.linear.predict(ground.sh))
     for c in track(iter(LOBE_COUNTS), len(LOBE_COUNTS), "fits per frame"):
-        predicted, fitted = raw_angle_lobes(ground, c)
-        yield method_row(ground, f"{c} lobes, fit per frame, no pose model", 6 * c, fitted)
-        yield method_row(ground, f"{c} lobes, raw angles", 6 * c, predicted, note="as the paper prints it")
-        yield method_row(ground, f"{c} lobes, anchored charts", 6 * c, anchored_lobes(ground, axes[c]))
-        yield method_row(ground, f"{c} lobes, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
+        kinds = {raw_label(c): ground.linear} | ({paper_label(c): joint_angles} if joint_angles else {})
+        fitted, predicted = raw_angle_lobes(ground, c, list(kinds.values()))
+        yield method_row(ground, f"{count_lobes(c)}, fit per frame, no pose model", 6 * c, fitted)
+        for label, sh in zip(kinds, predicted, strict=True):
+            yield method_row(ground, label, 6 * c, sh)
+        yield method_row(ground, f"{count_lobes(c)}, anchored charts", 6 * c, anchored_lobes(ground, axes[c]))
+        yield method_row(ground, f"{count_lobes(c)}, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
         for offset in (False, True):
-            note = "trained on all frames"
-            yield method_row(ground, refined_label(c, offset), 6 * c, refined[c, offset], note=note)
+            yield method_row(ground, refined_label(c, offset), 6 * c, refined[c, offset])

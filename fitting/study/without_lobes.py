@@ -9,7 +9,7 @@ import scipy.linalg
 from jaxtyping import Bool, Float
 
 from fitting.errors import SH
-from fitting.ridge import held_out_folds
+from fitting.ridge import held_out_folds, touched_by
 from fitting.study.ground import Ground, MethodRow, method_row, unoccluded_sh
 from fitting.training_data import TrainingData
 
@@ -103,7 +103,7 @@ class KernelPose:
         for g in groups[:: max(1, len(groups) // 4)][:4]:
             own = targets[:, self.data.groups == g].reshape(len(targets), -1).astype(np.float64)
             for i, left_out in enumerate(folds):
-                used = (self.weights > 0) & ~left_out
+                used = (self.weights > 0) & ~touched_by(self.data, left_out)
                 for k, predicted in enumerate(self.predict_group(g, own, used, KERNEL_RIDGES)):
                     scores[i, k] += np.sum((predicted[left_out] - own[left_out]) ** 2)
         return KERNEL_RIDGES[int(np.argmin(np.log(scores + 1e-12).mean(axis=0)))]

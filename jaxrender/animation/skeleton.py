@@ -231,6 +231,7 @@ def sample_clip(clip: Clip, skeleton: Skeleton, times: Float[Array, " f"]) -> Po
 
     Joints and properties without a channel keep their rest value.
     """
+    times = jnp.asarray(times)
     num_frames, num_joints, dtype = times.shape[0], len(skeleton.parents), times.dtype
     pose = {
         path: jnp.broadcast_to(jnp.asarray(getattr(skeleton.rest, path), dtype=dtype), (num_frames, num_joints, size))

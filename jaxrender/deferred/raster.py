@@ -207,7 +207,9 @@ def _fill_strip(
         own = own.reshape(plan.rows_per_strip, size, plan.grid.columns, size, s).swapaxes(1, 2)
         limits = own.reshape(n, size * size * s)[order]
     limits = jnp.pad(limits, ((0, -n % chunk), (0, 0))).reshape(*chunks.shape, -1)
-    fill = lambda own: _fill_chunk(triangles, planes, lists, *own, plan.grid, lanes, beyond is not None)  # noqa: E731
+    fill = lambda own: _fill_chunk(  # noqa: E731
+        triangles, planes, lists, own[0], own[1], plan.grid, lanes, beyond is not None
+    )
     filled = jax.lax.map(fill, (chunks, limits))
     place = jnp.zeros(n, jnp.int32).at[order].set(jnp.arange(n, dtype=jnp.int32))
 

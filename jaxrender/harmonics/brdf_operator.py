@@ -3,7 +3,7 @@
 The operator of a kernel f(cos θ) on the upper hemisphere H² is M[i, j] = ∫_{H²} f(cos θ) y_i y_j ds. It
 multiplies a function by the clamped lobe and projects, exactly: it is not the truncated product of two SH
 vectors. M is symmetric and couples only coefficients of equal m, so it commutes with rotations about z.
-Pointwise: any leading axes of exponents.
+Pointwise: any leading axes of exponents. Differentiable in all arrays.
 """
 
 import functools
@@ -94,9 +94,11 @@ def phong_operator(exponent: Float[Array, "*b"], *, order: int = 4) -> Float[Arr
     Args:
       exponent: α, any leading axes (one per vertex, say).
       order: number of bands, k = order².
+    Raises:
+      ValueError: if order < 1.
     References:
       Nowrouzezahrai et al., "Shadowed Relighting of Dynamic Geometry with 1D BRDFs", eq. 2 and appendix A, in
-      the closed form for any order; the appendix' list has two errors and a gap (docs/conventions.md).
+      the closed form for any order; the appendix' list has two errors and a gap (docs/paper.md).
     """
     check_order(order)
     exponent = jnp.asarray(exponent)
@@ -120,6 +122,8 @@ def brdf_operator(
 
     Args:
       kernel: vectorised f, called once with `num_nodes` cosines in (0, 1).
+    Raises:
+      ValueError: if order < 1 or num_nodes < order.
     """
     check_order(order)
     check_at_least("num_nodes", num_nodes, order)

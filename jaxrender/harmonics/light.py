@@ -1,6 +1,7 @@
 """Light as SH coefficients per colour channel: environment maps and lamps.
 
-A light has shape (c, order**2), world axes (right-handed, +Y up), radiance per channel.
+A light has shape (c, order**2), world axes (right-handed, +Y up), radiance per channel. All but the tables of
+`environment_directions` is differentiable in its arrays.
 """
 
 import math
@@ -62,6 +63,8 @@ def project_environment(image: Float[Array, "h w c"], *, order: int) -> Float[Ar
     Args:
       image: linear radiance; row 0 is +Y, the middle looks down -Z, columns turn towards +X. It must be
         finite (`jaxrender.io.read_environment` sees to that).
+    Raises:
+      ValueError: if order < 1, or the image has not three axes.
     """
     check_order(order)
     if image.ndim != 3:
@@ -82,6 +85,8 @@ def sh_directional_light(
     Args:
       direction: unit vector towards the lamp.
       radiance: irradiance on a plane that faces the lamp, per channel.
+    Raises:
+      ValueError: if order < 1, or a direction has not three components.
     """
     return radiance[..., :, None] * sh_basis(direction, order=order)[..., None, :]
 
@@ -96,6 +101,9 @@ def sh_area_light(
     """A disc of sky: constant radiance within `radius_radians` (0..π) of a unit direction.
 
     z_l = 2π √((2l+1)/4π) ∫_{cos r}^1 P_l, written with sin² r and P'_l so that a small disc does not cancel.
+
+    Raises:
+      ValueError: if order < 1, or a direction has not three components.
     """
     check_order(order)
     x = jnp.cos(radius_radians)
@@ -118,6 +126,8 @@ def sh_window(sh: Float[Array, "*b k"], *, width: float) -> Float[Array, "*b k"]
 
     Args:
       width: in bands, > 0; the number of bands or somewhat above is usual.
+    Raises:
+      ValueError: if width is not above 0, or the number of coefficients is no square.
     References:
       Sloan, "Stupid Spherical Harmonics (SH) Tricks", 2008, section on windowing.
     """

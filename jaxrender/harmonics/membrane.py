@@ -1,4 +1,7 @@
-"""The thin translucent sheet: diffuse light from the front, shadowed, and through the back, unshadowed."""
+"""The thin translucent sheet: diffuse light from the front, shadowed, and through the back, unshadowed.
+
+Differentiable in all arrays.
+"""
 
 import math
 
@@ -15,6 +18,9 @@ def back_lobe(*, order: int = 4) -> Float[Array, " k"]:
     """Transfer of the unoccluded back side in the normal frame: (1/π) max(0, -cos θ), the tabulated lobe.
 
     Mirroring a zonal function across the tangent plane negates its odd bands.
+
+    Raises:
+      ValueError: if order < 1.
     """
     sign = np.where(np.arange(order) % 2, -1.0, 1.0) / math.pi
     zonal = clamped_cosine_zh(order=order) * jnp.asarray(sign, dtype=float)
@@ -30,6 +36,8 @@ def membrane_transfer(
     Args:
       visibility: SH visibility in the vertex frame (z = normal), zero below the surface.
       transmission: τ in [0, 1], colour of the light that passes, times the local thinness.
+    Raises:
+      ValueError: if order < 1.
     References:
       Sloan, Luna, Snyder, "Local, Deformable Precomputed Radiance Transfer", 2005, eq. 22; Nowrouzezahrai et
       al., "Shadowed Relighting of Dynamic Geometry with 1D BRDFs", section 4.1.

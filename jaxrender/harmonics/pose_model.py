@@ -3,7 +3,8 @@
 A model has one linear map per shading point, from k pose components (and a constant) to 6c numbers: two chart
 coordinates and four zonal coefficients for each of c lobes. Points are grouped, usually by the bone they hang
 on most, and every group may see the pose through features of its own. A constant SH vector per point takes
-what the lobes leave on average over the training poses.
+what the lobes leave on average over the training poses. Differentiable from the pose on; Euler angles are not where
+they are singular.
 """
 
 import hashlib
@@ -28,7 +29,7 @@ from jaxrender.checks import bad_input, check_finite
 from jaxrender.harmonics.zh_fit import axis_from_chart, reference_frames
 from jaxrender.vecmath import einsum, safe_div, safe_sqrt
 
-FORMAT, FORMAT_VERSION = "jaxrender-pose-visibility", 1
+FORMAT, FORMAT_VERSION = "jaxrender-pose-visibility", 2
 FeatureKind = Literal["surroundings", "exponential_map", "euler", "given"]
 FEATURE_KINDS = ("surroundings", "exponential_map", "euler", "given")
 
@@ -95,7 +96,7 @@ def surroundings(
     For joint i at p with |p| = r in the frame of bone g, and length a = size / 9: the direction weighted like a
     solid angle, a p / (r² + a²); the nearness a / (2r + a); and a quarter of the joint's axes relative to the
     bone, times `falloff`. Joint angles would have to be multiplied out to get there: visibility is much closer
-    to linear in these numbers (docs/performance.md, section on generalisation). They do not change when the
+    to linear in these numbers (docs/performance.md). They do not change when the
     whole body moves.
 
     Args:

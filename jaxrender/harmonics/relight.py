@@ -30,6 +30,8 @@ def phong_transfer(visibility: Float[Array, "*v k"], exponent: Float[Array, "*#v
 
     Args:
       exponent: α >= 0, a scalar or one per vertex.
+    Raises:
+      ValueError: if the number of coefficients is no square.
     References:
       Nowrouzezahrai et al., "Shadowed Relighting of Dynamic Geometry with 1D BRDFs", eq. 2.
     """
@@ -51,6 +53,9 @@ def shade_transfer(
 
     The light would have to be turned into each vertex's frame, once per channel; the one transfer vector is turned
     into the world instead, which is the same product.
+
+    Raises:
+      ValueError: if the number of coefficients is no square, or a matrix is not 3 x 3.
     """
     return albedo * matmul(sh_rotate(transfer, world_from_local), light.T)
 
@@ -130,6 +135,8 @@ def relight(
       light: world SH radiance per channel.
       exponent: α >= 0, a scalar or one per vertex. 1 is a lobe as wide as the diffuse one, about the mirror direction.
       offset: SH visibility in the vertex frame to be added to the lobes (`PoseModel.offset`).
+    Raises:
+      ValueError: if the light's coefficients are no square number, or its bands not those of the lobes.
     References:
       Nowrouzezahrai et al., "Shadowed Relighting of Dynamic Geometry with 1D BRDFs", section 4.3, steps 2 to 5. The
       frame that lobes, offset and light meet in is the world's, not that of the reflection (see `_integrate_lobe`).
@@ -151,7 +158,11 @@ def relight_diffuse(
     *,
     offset: Float[Array, "*v k"] | None = None,
 ) -> Float[Array, "*v c"]:
-    """Lambert shading with self-shadows: the lobe of α = 1 about the normal. `offset` is as in `relight`."""
+    """Lambert shading with self-shadows: the lobe of α = 1 about the normal. `offset` is as in `relight`.
+
+    Raises:
+      ValueError: if the light's coefficients are no square number, or its bands not those of the lobes.
+    """
     visibility = _world_visibility(axes, coefficients, frames, offset=offset)
     return albedo * _integrate_lobe(visibility, frames[..., 2], _lambert(light), light)
 
@@ -171,6 +182,8 @@ def membrane(
     Args:
       transmission: τ per channel in [0, 1], one for all vertices (c,) or one each.
       offset: as in `relight`; the light through the back does not see it.
+    Raises:
+      ValueError: if the light's coefficients are no square number, or its bands not those of the lobes.
     References:
       Nowrouzezahrai et al., "Shadowed Relighting of Dynamic Geometry with 1D BRDFs", section 4.1 (light in the
       normal frame, no reflection).

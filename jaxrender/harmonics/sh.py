@@ -76,6 +76,8 @@ def sh_basis(directions: Float[Array, "*b 3"], *, order: int) -> Float[Array, "*
     Args:
       directions: unit vectors.
       order: number of bands, >= 1; k = order².
+    Raises:
+      ValueError: if order < 1, or a direction has not three components.
     References:
       Sloan, "Stupid Spherical Harmonics (SH) Tricks", 2008, appendix A2 (sign and normalisation).
     """
@@ -93,12 +95,18 @@ def sh_project(
     Args:
       values: f at the directions.
       weights: solid angle of each direction, in steradians (4π in all for the sphere).
+    Raises:
+      ValueError: if order < 1, or a direction has not three components.
     """
     return matmul(values, sh_basis(directions, order=order) * weights[:, None])
 
 
 def sh_evaluate(sh: Float[Array, "*#b k"], directions: Float[Array, "*#b 3"]) -> Float[Array, "*b"]:
-    """f(s) = Σ_i c_i y_i(s) at unit directions; leading axes broadcast, rank for rank."""
+    """f(s) = Σ_i c_i y_i(s) at unit directions; leading axes broadcast, rank for rank.
+
+    Raises:
+      ValueError: if the number of coefficients is no square, or a direction has not three components.
+    """
     return jnp.sum(sh * sh_basis(directions, order=order_of(sh)), axis=-1)
 
 
@@ -143,6 +151,8 @@ def sh_rotate(sh: Float[Array, "*#b k"], rotation: Float[Array, "*#b 3 3"]) -> F
 
     Args:
       rotation: rotation matrices, acting on column vectors.
+    Raises:
+      ValueError: if the number of coefficients is no square, or a matrix is not 3 x 3.
     """
     check_last_axis("rotation", rotation, 3)
     order = order_of(sh)
@@ -228,6 +238,8 @@ def sh_product(
 
     Args:
       order: bands of the result; default: those of `a`. The whole product has order_a + order_b - 1.
+    Raises:
+      ValueError: if a number of coefficients is no square.
     """
     order_a, order_b = order_of(a), order_of(b)
     order = order_a if order is None else order
@@ -239,7 +251,11 @@ def sh_product(
 
 
 def sh_convolve_zonal(sh: Float[Array, "*#b k"], kernel: Float[Array, "*#b l"]) -> Float[Array, "*b k"]:
-    """Convolution with a kernel that is circular about each direction: (k*f)_lm = √(4π/(2l+1)) k_l f_lm."""
+    """Convolution with a kernel that is circular about each direction: (k*f)_lm = √(4π/(2l+1)) k_l f_lm.
+
+    Raises:
+      ValueError: if the number of coefficients is no square, or the kernel has another number of bands.
+    """
     order = order_of(sh)
     check_last_axis("kernel", kernel, order)
     factors = np.sqrt(4 * math.pi / (2 * np.arange(order) + 1))
@@ -271,6 +287,8 @@ def sh_to_layout(sh: Float[Array, "*b k"], layout: str) -> Float[Array, "*b k"] 
       layout: `gaussian_splatting` (3D Gaussian Splatting, gsplat: the same as ours), `positive` (the table
         without the sign (-1)^m), `e3nn` (`spherical_harmonics(..., normalization="integral")`, whose polar
         axis is y) or `scipy` (complex coefficients of `scipy.special.sph_harm_y`, index l(l+1)+m).
+    Raises:
+      ValueError: if the number of coefficients is no square, or the layout is not one of these.
     """
     check_one_of("layout", layout, LAYOUTS)
     order = order_of(sh)
@@ -285,7 +303,11 @@ def sh_to_layout(sh: Float[Array, "*b k"], layout: str) -> Float[Array, "*b k"] 
 
 
 def sh_from_layout(sh: Float[Array, "*b k"] | Complex[Array, "*b k"], layout: str) -> Float[Array, "*b k"]:
-    """The inverse of `sh_to_layout`. From `scipy` the function is taken to be real."""
+    """The inverse of `sh_to_layout`. From `scipy` the function is taken to be real.
+
+    Raises:
+      ValueError: if the number of coefficients is no square, or the layout is unknown.
+    """
     check_one_of("layout", layout, LAYOUTS)
     order = order_of(sh)
     if layout == "gaussian_splatting":

@@ -2,7 +2,7 @@
 
 Visibility is kept as bits, one per vertex and direction, in the local frame of the vertex (z = skinned
 normal, zero below it): 32 bytes a vertex at 256 directions. Spherical harmonics, cosine-weighted transfer and
-shading truth all follow from the bits by one small matrix product.
+shading truth all follow from the bits by one small matrix product, which alone is differentiable, in its table.
 """
 
 import math
@@ -26,9 +26,11 @@ def hemisphere_directions(num_directions: int) -> Float[np.ndarray, "d 3"]:
 
     z is uniform in (0, 1) at the midpoints of equal strata, the azimuth advances by the golden angle.
 
+    Raises:
+      ValueError: if num_directions < 1.
     References:
       Keinert et al., "Spherical Fibonacci Mapping", 2015. Half the projection error of jittered strata at 256
-      directions (docs/performance.md).
+      directions (`tests/harmonics/test_visibility.py`).
     """
     check_at_least("num_directions", num_directions, 1)
     i = np.arange(num_directions)
@@ -58,6 +60,7 @@ def trace_visibility(
       bits, big-endian within a byte as `numpy.packbits` makes them; bytes = ceil(d / 8).
     Raises:
       InputError: if a position or a frame is not finite, or a face names a vertex that is not there.
+      ValueError: if there is no direction, or one has not three components.
     """
     check_last_axis("directions", directions, 3)
     check_at_least("number of directions", len(directions), 1)

@@ -1,7 +1,7 @@
 """Zonal harmonics: functions that are circular about an axis, one coefficient per band.
 
 Pointwise: any leading axes. A lobe is f(s) = Σ_l z_l √((2l+1)/4π) P_l(d·s) with unit axis d. The lobe with
-axis -d and coefficients (-1)^l z_l is the same function.
+axis -d and coefficients (-1)^l z_l is the same function. Differentiable in all arrays.
 """
 
 import math
@@ -18,6 +18,8 @@ from jaxrender.vecmath import constant_like
 def zh_to_sh(coefficients: Float[Array, "*#b l"], axis: Float[Array, "*#b 3"]) -> Float[Array, "*b k"]:
     """Coefficients of a lobe turned to a unit axis: v_lm = √(4π/(2l+1)) z_l y_lm(d).
 
+    Raises:
+      ValueError: if an axis has not three components.
     References:
       Sloan, Luna, Snyder, "Local, Deformable Precomputed Radiance Transfer", 2005; Nowrouzezahrai et al.,
       "Shadowed Relighting of Dynamic Geometry with 1D BRDFs", eq. 1 for one lobe.
@@ -29,7 +31,11 @@ def zh_to_sh(coefficients: Float[Array, "*#b l"], axis: Float[Array, "*#b 3"]) -
 
 
 def lobes_to_sh(coefficients: Float[Array, "*#b c l"], axes: Float[Array, "*#b c 3"]) -> Float[Array, "*b k"]:
-    """Sum of c lobes as SH coefficients (Shadowed Relighting, eq. 1, with c lobes, not c+1)."""
+    """Sum of c lobes as SH coefficients (Shadowed Relighting, eq. 1, with c lobes, not c+1).
+
+    Raises:
+      ValueError: if an axis has not three components.
+    """
     check_last_axis("axes", axes, 3)
     order = coefficients.shape[-1]
     factors = constant_like(np.sqrt(4 * math.pi / (2 * np.arange(order) + 1)), coefficients)
@@ -70,13 +76,21 @@ def _moments_on_hemisphere(power: int, order: int) -> np.ndarray:
 
 
 def clamped_cosine_zh(*, order: int) -> Float[Array, " l"]:
-    """Zonal coefficients of max(0, cos θ)."""
+    """Zonal coefficients of max(0, cos θ).
+
+    Raises:
+      ValueError: if order < 1.
+    """
     check_order(order)
     return jnp.asarray(_moments_on_hemisphere(1, order), dtype=float)
 
 
 def hemisphere_zh(*, order: int) -> Float[Array, " l"]:
-    """Zonal coefficients of the upper hemisphere's indicator: the visibility of an unoccluded point."""
+    """Zonal coefficients of the upper hemisphere's indicator: the visibility of an unoccluded point.
+
+    Raises:
+      ValueError: if order < 1.
+    """
     check_order(order)
     return jnp.asarray(_moments_on_hemisphere(0, order), dtype=float)
 
@@ -87,6 +101,8 @@ def phong_zh(exponent: Float[Array, "*b"], *, order: int) -> Float[Array, "*b l"
     z_l = √((2l+1)/4π) ρ_l with ρ_l = (α+1) ∫_0^1 x^α P_l(x) dx, a product of ratios of modulus below 1:
     accurate in float32 at any exponent, and smooth in it.
 
+    Raises:
+      ValueError: if order < 1.
     References:
       Ramamoorthi, Hanrahan, "Frequency Space Environment Map Rendering", 2002.
     """

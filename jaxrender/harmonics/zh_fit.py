@@ -3,6 +3,9 @@
 Pointwise: any leading axes. For given axes the lobe coefficients are a small linear problem per band and are
 eliminated in closed form (variable projection), so that the search runs over the axes only, two numbers a
 lobe. These live in a chart around a reference axis that has no pole and no wrap where axes go.
+
+Differentiable in coefficients and axes, the start axes aside; a search is so at the optimum where it ends (implicit
+differentiation), hence as well as it has converged.
 """
 
 import functools
@@ -196,6 +199,9 @@ def solve_lobe_coefficients(
     Band l decouples: G z_l = h_l with Gram matrix G_ij = P_l(d_i·d_j) and h_i = √(4π/(2l+1)) Σ_m y_lm(d_i)
     v_lm. Band 0 only knows the sum of the z_0, and lobes that coincide only the sum of theirs: these are split
     evenly. Differentiable in both arguments.
+
+    Raises:
+      ValueError: if order < 1, or there are not order² SH coefficients.
     """
     check_order(order, sh.shape[-1])
     basis = _lobe_basis(axes, order)
@@ -290,6 +296,9 @@ def fit_shared_axes(
 
     With fixed axes only the second moments Σ_f v_f v_fᵀ of each band matter; they are factored, so that the
     search costs the same for 300 frames as for 7.
+
+    Raises:
+      ValueError: if num_lobes or order < 1, or there are not order² SH coefficients.
     """
     check_at_least("num_lobes", num_lobes, 1)
     check_order(order, sh.shape[-1])
@@ -372,6 +381,8 @@ def fit_zh_lobes(
       num_lobes: c; one lobe has 6 degrees of freedom, two have 11, three nearly always all 16 of order 4.
       anchor_axes: unit axes around which the charts are laid, one set per vertex.
       anchor: strength of the penalty, relative to squared SH coefficients; used only with `anchor_axes`.
+    Raises:
+      ValueError: if num_lobes or order < 1, anchor < 0, or there are not order² SH coefficients.
     References:
       Sloan, Luna, Snyder, "Local, Deformable Precomputed Radiance Transfer", 2005, section on lobe fitting.
     """

@@ -11,7 +11,7 @@ from jaxrender.io.surfaces import SceneSurface, merged_scene, no_lights, on_devi
 from jaxrender.scene import OPAQUE, Material, Scene, SceneImage
 
 #: Side of the floor in metres, and of one of its tiles.
-_FLOOR, _TILE = 6.0, 0.5
+_FLOOR, _TILE = 2.4, 0.3
 
 
 def builtin_scene(*, num_vertices: int = 6000) -> Scene:

@@ -3,12 +3,13 @@
 NumPy in, NumPy out: ray casting is not differentiable and happens outside `jit`.
 """
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from jaxrender.machine import num_cores
 
 RAYS_PER_TASK = 1 << 17
 
@@ -24,11 +25,6 @@ class Hits:
     triangle: Int[np.ndarray, " n"]
     t: Float[np.ndarray, " n"]
     barycentrics: Float[np.ndarray, "n 2"]
-
-
-def num_threads() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class EmbreeScene:
@@ -88,7 +84,7 @@ def pool() -> ThreadPoolExecutor:
     """The threads that all scenes share, one per core."""
     global _pool
     if _pool is None:
-        _pool = ThreadPoolExecutor(num_threads(), thread_name_prefix="rays")
+        _pool = ThreadPoolExecutor(num_cores(), thread_name_prefix="rays")
     return _pool
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 
@@ -14,10 +15,10 @@ from safetensors.numpy import load_file
 
 from fitting.cli import main
 from fitting.config import BakeSettings, FitSettings, SplitSettings, TrainSettings
-from fitting.dataset import VisibilityStore, choose_points
+from fitting.dataset import VisibilityStore, choose_points, represent_by_visible
 from fitting.features import all_raw_features, unfitted_basis
 from fitting.fit import predict_sh
-from fitting.model import MODEL_FILE, find_model, save_pose_model, to_half
+from fitting.model import MODEL_FILE, find_model, model_header, save_pose_model, to_half
 from fitting.motion import CLIP, MIXED, SEGMENT, TRAIN, articulating_joints, limb_starts, sample_motion
 from fitting.train import train_character, train_sequence
 from fitting.training_data import bake_character
@@ -43,6 +44,33 @@ def character():
 def trained(character, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     return train_character(character, SMALL, folder), folder
+
+
+def one_hinge(clip, joints):
+    """The keys of one joint's rotation, turned about one axis only."""
+    channel = next(c for c in clip.channels if c.path == "rotation" and c.joint in joints)
+    times = np.linspace(0.0, 1.0, 5)
+    half = 0.4 * np.sin(4.0 * times)
+    zero = np.zeros_like(times)
+    turns = np.stack([np.sin(half), zero, zero, np.cos(half)], axis=-1)
+    return (dataclasses.replace(channel, interpolation="LINEAR", times=times, values=turns),)
+
+
+def bvh_of(elbow):
+    """An arm of three bones of which only the elbow turns, by these angles."""
+    bones = [("Shoulder", "0 0 0"), ("Elbow", "30 0 0"), ("Wrist", "25 0 0")]
+    text = "HIERARCHY\n"
+    for number, (name, offset) in enumerate(bones):
+        channels = "CHANNELS 3 Zrotation Xrotation Yrotation"
+        text += f"{'ROOT' if number == 0 else 'JOINT'} {name}\n{{\nOFFSET {offset}\n{channels}\n"
+    text += "End Site\n{\nOFFSET 10 0 0\n}\n" + "}\n" * len(bones)
+    rows = "\n".join(f"0 0 0 {angle} 0 0 0 0 0" for angle in elbow)
+    return text + f"MOTION\nFrames: {len(elbow)}\nFrame Time: 0.033333\n{rows}\n"
+
+
+def header_of(result):
+    source = {"name": "n", "content_hash": "h", "input": None, "num_vertices": 2000}
+    return json.loads(json.dumps(model_header(result, SMALL, source=source, errors={})))
 
 
 def global_error(result, part):
@@ -94,6 +122,26 @@ def test_an_interrupted_bake_continues_and_ends_with_the_same_bits(trained, char
     np.testing.assert_array_equal(data.bits, result.data.bits)
 
 
+def test_frames_that_are_damaged_on_disk_are_baked_again(trained, character, tmp_path):
+    result, folder = trained
+    shutil.copytree(folder / "bake.zarr", tmp_path / "bake.zarr")
+    chunks = sorted((tmp_path / "bake.zarr" / "visibility" / "c").iterdir(), key=lambda p: int(p.name))
+    lost, cut = next(chunks[3].rglob("0")), next(p for p in chunks[5].rglob("0") if p.is_file())
+    shutil.rmtree(lost) if lost.is_dir() else lost.unlink()
+    cut.write_bytes(cut.read_bytes()[:-9])
+    data, statistics, _ = bake_character(character, SMALL, tmp_path / "bake.zarr")
+    assert statistics.frames_done_before == len(data.part) - 2
+    np.testing.assert_array_equal(data.bits, result.data.bits)
+
+
+def test_no_visible_vertex_is_left_to_a_point_that_sees_nothing(trained, character):
+    visible = np.arange(60) % 3 > 0
+    points = represent_by_visible(character, trained[0].data.points, visible)
+    others = np.setdiff1d(np.arange(len(points.of_vertex)), points.vertices)
+    assert visible[points.of_vertex[others]].all()
+    np.testing.assert_array_equal(points.of_vertex[points.vertices], np.arange(len(visible)))
+
+
 def test_a_store_of_other_contents_is_replaced_and_a_foreign_folder_refused(tmp_path):
     bake = BakeSettings(num_directions=64)
     store = VisibilityStore(tmp_path / "s", num_frames=2, num_points=3, bake=bake, source="a")
@@ -109,8 +157,7 @@ def test_a_store_of_other_contents_is_replaced_and_a_foreign_folder_refused(tmp_
 
 def test_a_model_file_keeps_everything(trained, tmp_path):
     result, _ = trained
-    header = {"format": "jaxrender-pose-visibility", "version": 1, "feature_kind": "surroundings"}
-    header |= {"feature_size": result.model.features.size, "note": 'text with "quotes"'}
+    header = header_of(result) | {"note": 'text with "quotes"'}
     save_pose_model(tmp_path / MODEL_FILE, result.model, header)
     loaded, read, _ = find_model(tmp_path)
     assert read == header
@@ -205,6 +252,11 @@ def test_bad_characters_are_refused_in_one_line(character, tmp_path):
     frozen = dataclasses.replace(character, clips=(Clip("frozen", (), 0.0, 1.0),))
     with pytest.raises(InputError, match="active joints"):
         train_character(frozen, SMALL, tmp_path)
+    # One channel of one joint: the matrix of joint angles has rank 1.
+    keys = one_hinge(character.clips[0], articulating_joints(character))
+    hinge = dataclasses.replace(character, clips=(Clip("hinge", keys, 0.0, 1.0),))
+    with pytest.raises(InputError, match="joint angles of rank 2 or more over the frames, got rank 1"):
+        train_character(hinge, SMALL, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -217,6 +269,9 @@ def test_bad_characters_are_refused_in_one_line(character, tmp_path):
         (["inspect", "TRUNCATED"], "safetensors"),
         (["train", "--fit.num-lobes", "7", "-o", "OUT"], "num_lobes"),
         (["train", "-o", "FILE/below"], "FILE"),
+        (["train", "EMPTY", "-o", "OUT"], "EMPTY: input: expected a glTF, GLB or BVH file, got a folder"),
+        (["train", "STILL", "-o", "OUT"], "still.bvh: training frames: expected at least 2"),
+        (["train", "HINGE", "-o", "OUT"], "hinge.bvh: poses: expected joint angles of rank 2 or more"),
     ],
 )
 def test_bad_arguments_end_with_one_line_and_status_2(arguments, words, tmp_path, capsys):
@@ -224,15 +279,18 @@ def test_bad_arguments_end_with_one_line_and_status_2(arguments, words, tmp_path
     (tmp_path / "FILE").write_text("a file")
     (tmp_path / "TRUNCATED").write_bytes(b"glTF\x02\x00\x00\x00")
     places = {name: str(tmp_path / name) for name in ("OUT", "EMPTY", "TRUNCATED", "FILE/below")}
+    places |= {"STILL": str(tmp_path / "still.bvh"), "HINGE": str(tmp_path / "hinge.bvh")}
+    (tmp_path / "still.bvh").write_text(bvh_of([0.0]))
+    (tmp_path / "hinge.bvh").write_text(bvh_of([0.0, 5.0, 20.0, 40.0, 30.0, 10.0, -10.0]))
     assert main([places.get(word, word) for word in arguments]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert words in "".join(lines) and "Traceback" not in "".join(lines)
-    assert not (tmp_path / "OUT").exists() or not list((tmp_path / "OUT").glob("*.safetensors"))
+    assert not (tmp_path / "OUT").exists()
 
 
 def test_inspect_prints_json(trained, tmp_path, capsys):
     result, _ = trained
-    header = {"format": "jaxrender-pose-visibility", "version": 1, "feature_kind": "surroundings", "feature_size": 1.7}
+    header = header_of(result)
     save_pose_model(tmp_path / MODEL_FILE, result.model, header)
     assert main(["inspect", str(tmp_path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["header"] == header

@@ -27,11 +27,12 @@ def dtype(request):
 
 def closed_form(features, targets, ridge):
     """Weights and bias through the singular values, in float64."""
-    a, b = features - features.mean(0), targets - targets.mean(0)
+    scale = features.std(0)
+    a, b = (features - features.mean(0)) / scale, targets - targets.mean(0)
     u, s, vt = np.linalg.svd(a, full_matrices=False)
     kept = s > 1e-10 * s.max(initial=1e-300)
     gain = np.where(kept, s / np.where(kept, s * s + ridge * (s * s).sum() / a.shape[1], 1), 0)
-    weights = vt.T @ (gain[:, None] * (u.T @ b))
+    weights = vt.T @ (gain[:, None] * (u.T @ b)) / scale[:, None]
     return weights, targets.mean(0) - features.mean(0) @ weights
 
 
@@ -113,6 +114,45 @@ def test_bias_is_not_penalised(rng, x64):
     assert_close(predicted, harmonics.predict_linear(fit, features) + 100.0, ulps=TIGHT)
     stiff = fit_linear(features, targets + 100.0, ridge=1e12)
     assert_close(stiff.bias, (targets + 100.0).mean(0), ulps=TIGHT)
+
+
+@pytest.mark.parametrize("shape", [(40, 6), (7, 12)])
+@pytest.mark.parametrize("ridge", [1e-3, 0.5])
+def test_the_unit_of_a_feature_does_not_matter(shape, ridge, rng, dtype):
+    """Metres or millimetres in one column: its weight changes by 1e3, and nothing else does."""
+    features, targets = rng.normal(size=shape) + 2.0, jnp.asarray(rng.normal(size=(shape[0], 3)), dtype)
+    unit = np.ones(shape[1])
+    unit[1] = 1e3
+    fits, predictions = [], []
+    for factor in (np.ones(shape[1]), unit):
+        scaled = jnp.asarray(features * factor, dtype)
+        fits.append(fit_linear(scaled, targets, ridge=ridge))
+        predictions.append(harmonics.predict_linear(fits[-1], scaled))
+    assert_close(np.asarray(fits[1].weights) * unit[:, None], fits[0].weights, ulps=ulps(dtype), dtype=dtype)
+    assert_close(predictions[1], predictions[0], ulps=ulps(dtype), dtype=dtype)
+    assert_close(fits[1].residual, fits[0].residual, ulps=ulps(dtype), dtype=dtype)
+    assert int(fits[1].rank) == int(fits[0].rank) == min(shape[0] - 1, shape[1])
+
+
+def test_a_constant_column_among_others_gets_no_weight(rng, dtype):
+    """Its mean is a rounded one, and what is left after centring must not be blown up to standard deviation 1."""
+    features, targets = rng.normal(size=(30, 4)), rng.normal(size=(30, 2))
+    features[:, 2] = 1e6 / 3.0
+    fit = fit_linear(jnp.asarray(features, dtype), jnp.asarray(targets, dtype), ridge=0.0)
+    assert int(fit.rank) == 3
+    assert not np.any(fit.weights[2])
+    others, bias = closed_form(features[:, [0, 1, 3]], targets, 0.0)
+    assert_close(fit.weights[np.array([0, 1, 3])], others, ulps=ulps(dtype), dtype=dtype)
+    assert_close(fit.bias, bias, ulps=ulps(dtype), dtype=dtype)
+
+
+def test_a_small_change_of_a_large_number_counts(rng, x64):
+    """A column of 1e6 that moves by 1e-4 is a feature like any other."""
+    features, targets = rng.normal(size=(30, 3)), rng.normal(size=(30, 2))
+    far = features * np.array([1.0, 1e-4, 1.0]) + np.array([0.0, 1e6, 0.0])
+    fit, moved = fit_linear(features, targets, ridge=0.1), fit_linear(far, targets, ridge=0.1)
+    # 1e6 carries eps · 1e6 = 2e-10, which is 2e-6 of the change.
+    assert_close(1e-4 * np.asarray(moved.weights)[1], fit.weights[1], ulps=1e11)
 
 
 def test_ridge_is_relative_to_the_size_of_the_features(rng, x64):

@@ -346,7 +346,7 @@ def test_no_header(tmp_path):
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("format", "other"), ("version", 2), ("version", None), ("version", "1"), ("feature_kind", "angles"),
+        ("format", "other"), ("version", 3), ("version", None), ("version", "1"), ("feature_kind", "angles"),
         ("feature_kind", None), ("feature_size", 0), ("feature_size", -1.0), ("feature_size", float("nan")),
         ("feature_size", float("inf")), ("feature_size", "2"), ("feature_size", True), ("feature_size", None),
     ],

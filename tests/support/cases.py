@@ -53,8 +53,8 @@ def _residual_beside_1(fit: Any) -> tuple:
 class Case:
     """One call, made by keywords, and how far its two results may lie apart (units: see tolerances.py).
 
-    `gradients` names the array arguments whose derivatives are compared, in float64: that shows whether the
-    formulas agree. Where an argument lives on a manifold (`on`: "sphere" for unit vectors and quaternions,
+    `gradients` names the arrays, and the records of arrays, whose derivatives are compared, in float64: that shows
+    whether the formulas agree. Where an argument lives on a manifold (`on`: "sphere" for unit vectors and quaternions,
     "rotation" for matrices) only the tangential part counts: formulas may differ off it.
     """
 
@@ -66,6 +66,7 @@ class Case:
     ulps64: float = TIGHT
     ulps32: float = ROUNDING
     gradient_ulps: float = TIGHT
+    known: tuple[str, ...] = ()  # arrays that jaxrender must see when it is traced: connectivity
     entrywise: bool = False  # each entry's own magnitude is the scale
     host: bool = False  # runs on NumPy in float64 only: tables and bakes
     outcome: Callable[[Any], Any] = _whole  # what of the result is compared
@@ -368,6 +369,8 @@ def _zh_fit() -> list[Case]:
 
 def _linear_model() -> list[Case]:
     tall, wide = _normal(40, 6) + 2.0, _normal(7, 12) + 2.0
+    units = np.array([1.0, 1e3, 1e-3, 1.0, 50.0, 1.0])
+    constant = np.where(np.arange(6) == 3, 1e6 / 3.0, units * tall)
     fit = {"weights": _normal(6, 4), "bias": _normal(4), "rank": np.array(6), "residual": np.array(0.1)}
     return [
         *(
@@ -380,6 +383,19 @@ def _linear_model() -> list[Case]:
             )
             for name, a in (("tall", tall), ("wide", wide))
             for ridge in (0.0, 1e-2)
+        ),
+        Case(
+            "harmonics.linear_model.fit_linear",
+            {"features": units * tall, "targets": tall[:, :3] ** 2, "ridge": np.array(0.1)},
+            "mixed units",
+            gradients=("features", "targets", "ridge"),
+            outcome=_residual_beside_1,
+        ),
+        Case(
+            "harmonics.linear_model.fit_linear",
+            {"features": constant, "targets": tall[:, :3] ** 2, "ridge": 0.1},
+            "a constant column",
+            outcome=_residual_beside_1,
         ),
         Case(
             "harmonics.linear_model.fit_linear",
@@ -874,12 +890,137 @@ def _warps() -> list[Case]:
     ]
 
 
+def _camera_record(eye: list, target: list, up: list) -> Record:
+    vectors = {"eye": np.array(eye), "target": np.array(target), "up": np.array(up)}
+    return Record("camera.Camera", {**vectors, "fov_y_radians": np.array(0.7)})
+
+
+def _camera() -> list[Case]:
+    eye, target, up = [1.2, 2.0, 3.1], [0.1, 0.9, -0.2], [0.2, 1.3, 0.1]
+    camera = _camera_record(eye, target, up)
+    size = {"height": 3, "width": 4}
+    views = {
+        "general": (eye, target, up),
+        "straight down": ([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]),
+        "straight up": ([0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 3.0, 0.0]),
+        "eye at target": (eye, eye, up),
+    }
+    box = {"minimum": np.array([-0.4, 0.0, -1.5]), "maximum": np.array([0.6, 1.8, 0.3])}
+    angles = {"azimuth_radians": np.array(0.7), "elevation_radians": np.array(-0.4)}
+    # Beside and behind the eye too; the last one lies in its plane.
+    points = np.concatenate([_normal(5, 3), np.array([np.array(eye) + np.cross(up, np.subtract(eye, target))])])
+    planes = {"near": np.array(0.5), "far": np.array(40.0)}
+    return [
+        Case("camera.clip_from_world", {"camera": camera, **size, **planes}, gradients=("camera", "near", "far")),
+        *(
+            Case("camera.depth_range", {"camera": _camera_record(*views[name]), **box}, name, gradients=("minimum",))
+            for name in ("general", "straight down")
+        ),
+        *(
+            Case(
+                "camera.look_at",
+                {name: np.array(v) for name, v in zip(("eye", "target", "up"), vectors, strict=True)},
+                label,
+                gradients=("eye", "target", "up"),
+            )
+            for label, vectors in views.items()
+        ),
+        Case("camera.view_from_world", {"camera": camera}, gradients=("camera",)),
+        Case("camera.camera_rays", {"camera": camera, **size}, "centres", gradients=("camera",)),
+        *(
+            Case(
+                "camera.camera_rays",
+                {"camera": camera, **size, "offsets": _uniform(0, 1, *shape)},
+                f"offsets {shape}",
+                gradients=("camera", "offsets"),
+            )
+            for shape in ((2,), (3, 4, 2))
+        ),
+        Case(
+            "camera.project_px",
+            {"camera": camera, "points": points[:-1], "height": 6, "width": 9},
+            gradients=("camera", "points"),
+        ),
+        Case(
+            "camera.project_px",
+            {
+                "camera": _camera_record([0.0, 0.0, 5.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]),
+                "points": np.array([[1.0, 2.0, 5.0], [0.0, 0.0, 5.0]]),
+                **size,
+            },
+            "in the plane of the eye",
+            gradients=("points",),
+        ),
+        Case(
+            "camera.frame_bounds",
+            {**box, **angles, "aspect": 1.9, "fov_y_radians": 0.9},
+            "wide",
+            gradients=(*box, *angles),
+        ),
+        Case("camera.frame_bounds", {**box, **angles, "aspect": 0.5, "margin": 0.3}, "tall", gradients=tuple(box)),
+        Case("camera.frame_bounds", {**box, "elevation_radians": math.pi / 2}, "from above"),
+        Case("camera.frame_bounds", {"minimum": np.ones(3), "maximum": np.ones(3)}, "a point"),
+    ]
+
+
+def _metrics() -> list[Case]:
+    image = _uniform(0, 1, 13, 16, 2)
+    reference = np.clip(image + 0.1 * _normal(13, 16, 2), 0.0, 1.0)
+    pair = {"image": image, "reference": reference}
+    values = {"values": _normal(4, 5), "reference": _normal(4, 5)}
+    zeros = np.zeros((4, 5))
+    numbers = _uniform(-0.9, 1.9, 4, 5)
+    return [
+        Case("metrics.mse", pair, gradients=tuple(pair)),
+        Case("metrics.psnr", {**pair, "peak": 2.0}, gradients=tuple(pair)),
+        Case("metrics.psnr", {"image": image, "reference": image}, "equal"),
+        Case("metrics.relative_l2", values, gradients=tuple(values)),
+        Case("metrics.relative_l2", {"values": zeros, "reference": zeros}, "zeros", gradients=tuple(values)),
+        Case("metrics.relative_l2", {**values, "values": values["reference"]}, "equal", gradients=tuple(values)),
+        Case("metrics.ssim", pair, host=True),
+        Case(
+            "metrics.ssim",
+            {"image": 9.0 * image[:11], "reference": 9.0 * reference[:11], "peak": 9.0},
+            "peak 9",
+            host=True,
+        ),
+        Case("metrics.heatmap", {"values": numbers, "low": -1.0, "high": 2.0}, "inside", gradients=("values",)),
+        Case("metrics.heatmap", {"values": numbers, "low": -0.2, "high": 0.7}, "clamped", gradients=("values",)),
+        Case("metrics.heatmap", {"values": np.where(numbers > 1.5, np.nan, numbers)}, "with NaN"),
+        Case("metrics.heatmap", {"values": zeros}, "constant"),
+    ]
+
+
+def _scene() -> list[Case]:
+    # A tetrahedron whose faces all turn outwards, and a vertex without faces.
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 2, 2]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
+    vertices = corners + 0.2 * _normal(3, 5, 3)
+    strip = np.array([[0, 1, 2], [2, 1, 3]], dtype=np.int32)
+    sequence = {"vertices": vertices, "features": _normal(3, 2)}
+    return [
+        *(
+            Case("scene.vertex_normals", {"vertices": v, "faces": faces}, label, gradients=("vertices",))
+            for label, v in (("one", vertices[0]), ("leading axes", vertices))
+        ),
+        *(
+            Case(
+                "scene.make_mesh_sequence",
+                {**sequence, "faces": f},
+                label,
+                gradients=("vertices", "features"),
+                known=("faces",),
+            )
+            for label, f in (("closed", faces), ("strip", strip))
+        ),
+    ]
+
+
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
         _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility,
-        _pose_model, _skeleton, _skinning, _texture,
-        _quads, _warps,
+        _pose_model, _skeleton, _skinning, _camera, _metrics, _scene, _texture, _quads, _warps,
     )
     for case in room()
 )  # fmt: skip

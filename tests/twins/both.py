@@ -43,21 +43,22 @@ def run_jax(case: Case, dtype: Any) -> tuple[Any, dict[str, np.ndarray]]:
         # Compiling is nearly all of the time here, and twins are about formulas: no need to optimise.
         compiled = jax.jit(whole, compiler_options={"xla_backend_optimization_level": 0})
         slopes, result = jax.block_until_ready(compiled(free, arrays))
-        return result, {name: _tangential(case, name, np.asarray(g)) for name, g in slopes.items()}
+        pairs = [pair for name, slope in slopes.items() for pair in flatten(slope, name)]
+        return result, {name: _tangential(case, name, np.asarray(g)) for name, g in pairs}
 
 
 def run_torch(case: Case, dtype: Any) -> tuple[Any, dict[str, np.ndarray]]:
     """The same of the twin."""
     with _default_dtype(dtype):
         arrays, rest = _arguments(case, "torchref", lambda x: torch.tensor(_rounded(x, dtype)))
-        names = _differentiated(case, dtype)
-        free = [arrays[name].requires_grad_() for name in names]
+        named = [pair for name in _differentiated(case, dtype) for pair in flatten(arrays[name], name)]
+        free = [x.requires_grad_() for _, x in named]
         result = case.outcome(public("torchref", case.kernel)(**arrays, **rest))
         outputs = [x for x in _arrays(result) if x.is_floating_point()]
         parts = [(x * torch.tensor(w, dtype=x.dtype)).sum() for x, w in zip(outputs, _mix(outputs), strict=True)]
-        slopes = torch.autograd.grad(sum(parts), free) if free else []
-        pairs = zip(names, slopes, strict=True)
-        return result, {name: _tangential(case, name, g.numpy()) for name, g in pairs}
+        slopes = torch.autograd.grad(sum(parts), free, materialize_grads=True) if free else []
+        pairs = zip(named, slopes, strict=True)
+        return result, {name: _tangential(case, name, g.numpy()) for (name, _), g in pairs}
 
 
 def run_host(case: Case) -> tuple[Any, Any]:
@@ -77,11 +78,14 @@ def _arrays(result: Any) -> list:
 
 
 def _arguments(case: Case, package: str, array: Callable[[np.ndarray], Any]) -> tuple[dict, dict]:
-    """The case's array arguments, and all its others."""
+    """The case's arguments that JAX traces, arrays and records that are differentiated, and all its others."""
     built = {name: _build(x, package, array) for name, x in case.arguments.items()}
-    is_array = {name: isinstance(x, np.ndarray) for name, x in case.arguments.items()}
-    arrays = {name: x for name, x in built.items() if is_array[name]}
-    return arrays, {name: x for name, x in built.items() if not is_array[name]}
+    traced = {
+        name
+        for name, x in case.arguments.items()
+        if name in case.gradients or (isinstance(x, np.ndarray) and name not in case.known)
+    }
+    return {n: x for n, x in built.items() if n in traced}, {n: x for n, x in built.items() if n not in traced}
 
 
 def _build(value: Any, package: str, array: Callable[[np.ndarray], Any]) -> Any:
@@ -107,12 +111,12 @@ def _mix(outputs: list) -> list[np.ndarray]:
 
 def _tangential(case: Case, name: str, slope: np.ndarray) -> np.ndarray:
     """The part of a derivative along the manifold on which the argument lives."""
+    if name not in case.on:
+        return slope
     at = case.arguments[name].astype(slope.dtype)
-    if case.on.get(name) == "sphere":
+    if case.on[name] == "sphere":
         return slope - (slope * at).sum(-1, keepdims=True) * at
-    if case.on.get(name) == "rotation":
-        return (slope - at @ slope.swapaxes(-1, -2) @ at) / 2.0
-    return slope
+    return (slope - at @ slope.swapaxes(-1, -2) @ at) / 2.0
 
 
 @contextlib.contextmanager

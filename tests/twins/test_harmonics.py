@@ -1,10 +1,10 @@
-"""jaxrender.harmonics and its ground floor against the twin, kernel by kernel: values and derivatives."""
+"""jaxrender.harmonics against the twin, kernel by kernel: values and derivatives."""
 
 import pytest
 
 from tests.twins.agreement import cases_of, check
 
 
-@pytest.mark.parametrize(("case", "dtype"), cases_of("vecmath.", "harmonics."))
+@pytest.mark.parametrize(("case", "dtype"), cases_of("harmonics."))
 def test_twin(case, dtype):
     check(case, dtype)

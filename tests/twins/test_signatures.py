@@ -17,8 +17,8 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 # What of jaxrender has a partner in torchref: whole rooms, and single modules. The rest of `animation` builds
 # the data of the built-in body.
 PAIRED = (
-    "vecmath", "harmonics.", "animation.skeleton", "animation.skinning",
-    "deferred.texture", "deferred.quads", "deferred.warps",
+    "vecmath", "camera", "metrics", "scene", "harmonics.", "animation.skeleton", "animation.skinning",
+    "deferred.samples", "deferred.texture", "deferred.quads", "deferred.warps",
 )  # fmt: skip
 UNPAIRED_MODULES = {"harmonics.pipeline": "the order of the stages, no arithmetic"}
 
@@ -35,11 +35,17 @@ EXCEPTIONS = {
     "harmonics.pose_model.model_arrays": "jaxrender writes and checks files; the twin only loads",
     "harmonics.pose_model.read_model_file": "the same",
     "harmonics.pose_model.model_hash": "the same",
+    "scene.Material": "what files are read into; torchref reads none",
+    "scene.Lights": "the same",
+    "scene.SceneImage": "the same",
+    "scene.Scene": "the same",
+    "scene.scene_bounds": "of such a record",
+    "scene.whole_scene_camera": "the same",
     "deferred.quads.Quads": "of jaxrender's screen triangles, which the twin's Fragments do not hold",
     "deferred.quads.quad_coverage": "the same; judged by brute force in tests/deferred",
     "deferred.quads.visible_quads": "the same",
     "deferred.quads.visible_masks": "the same",
-    "deferred.quads.draw_overdraw": "a picture: metrics has no twin",
+    "deferred.quads.draw_overdraw": "a picture for people",
     "harmonics.sh.triple_product_tensor": "torchref's way to the product",
     "harmonics.zh.zonal_integral": "torchref integrates where jaxrender has closed forms",
 }
@@ -49,6 +55,8 @@ COMPARED_APART = {
     "harmonics.zh_fit.fit_zh_lobes": "the search of each side ends at its own digits: judged by error",
     "harmonics.zh_fit.fit_shared_axes": "the same",
     "harmonics.pose_model.load_pose_model": "reads a file",
+    "deferred.samples.ordered_grid": "field by field in tests/twins/test_raster.py",
+    "deferred.samples.standard_pattern": "the same",
     "deferred.quads.quad_derivatives": "on fragments that each side rasterises: tests/twins/test_quads.py",
 }
 

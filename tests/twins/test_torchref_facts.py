@@ -13,7 +13,7 @@ from torch import Tensor
 from tests.support import oracles
 from tests.support.asserts import assert_close
 from tests.support.tolerances import TIGHT
-from torchref import vecmath
+from torchref import camera, metrics, vecmath
 from torchref.animation import skeleton, skinning
 from torchref.harmonics import (
     brdf_operator,
@@ -26,6 +26,7 @@ from torchref.harmonics import (
     zh,
     zh_fit,
 )
+from torchref.scene import make_mesh_sequence, vertex_normals
 
 
 def tensor(array) -> Tensor:
@@ -430,7 +431,8 @@ def test_linear_fit_solves_the_normal_equations(rng, shape, ridge):
     fit = linear_model.fit_linear(tensor(a), tensor(b), ridge=ridge)
     ac, bc = a - a.mean(0), b - b.mean(0)
     x = fit.weights.numpy()
-    penalty = ridge * (ac**2).sum() / shape[1]
+    # A weight w costs (w σ)², and σ² summed over frames and meaned over columns of unit σ is their number.
+    penalty = ridge * len(a) * a.var(0)[:, None]
     gradient = ac.T @ (ac @ x - bc) + penalty * x
     assert np.abs(gradient).max() < 1e-12 * np.abs(ac.T @ bc).max()
     assert int(fit.rank) == min(shape[0] - 1, shape[1])
@@ -608,3 +610,65 @@ def test_tangent_is_the_published_one(rng):
     a = -1 / (sign + z)
     expected = np.stack([1 + sign * x * x * a, sign * x * y * a, -sign * x], -1)
     assert_close(vecmath.orthonormal_tangent(tensor(n)), expected, ulps=TIGHT)
+
+
+# --- camera, metrics, scene
+# ------------------------------------------------------------------------------------------------------
+
+
+def test_pixels_and_rays_are_inverse(rng):
+    eye, target, up = (tensor(rng.normal(size=3)) for _ in range(3))
+    view = camera.Camera(eye, target, up, tensor(0.9))
+    origins, directions = camera.camera_rays(view, height=4, width=7)
+    px, depth = camera.project_px(view, origins + 3.0 * directions, height=4, width=7)
+    rows, columns = np.meshgrid(np.arange(4) + 0.5, np.arange(7) + 0.5, indexing="ij")
+    assert_close(px, np.stack([columns, rows], axis=-1), ulps=TIGHT)
+    # The top row's outer edge is half the field of view above the axis.
+    edge = camera.camera_rays(view, height=4, width=7, offsets=tensor([0.5, 0.0]))[1][0, 3]
+    assert math.acos((edge @ (target - eye)) / (target - eye).norm()) == pytest.approx(0.45, rel=1e-12)
+    view_from_world = camera.view_from_world(view)
+    ahead = tensor([0.0, 0.0, -(target - eye).norm().item(), 1.0])
+    assert_close(view_from_world @ torch.cat([target, tensor([1.0])]), ahead, ulps=TIGHT)
+    assert_close(view_from_world[:3, :3].T, camera.look_at(eye, target, up), ulps=TIGHT)
+    assert (depth > 0).all()
+
+
+def test_framed_box_touches_the_edge_of_the_picture():
+    low, high = tensor([-0.4, 0.0, -1.5]), tensor([0.6, 1.8, 0.3])
+    corners = tensor([[x, y, z] for x in (-0.4, 0.6) for y in (0.0, 1.8) for z in (-1.5, 0.3)])
+    view = camera.frame_bounds(low, high, azimuth_radians=0.7, elevation_radians=0.4, aspect=1.5, margin=0.0)
+    px, _ = camera.project_px(view, corners, height=100, width=150)
+    assert torch.cat([px, tensor([150.0, 100.0]) - px], dim=-1).min().item() == pytest.approx(0.0, abs=1e-10)
+
+
+def test_metrics_of_known_images(rng):
+    image, reference = torch.full((12, 12, 1), 0.75).double(), torch.full((12, 12, 1), 0.25).double()
+    assert metrics.mse(image, reference) == 0.25
+    assert metrics.psnr(image, reference).item() == pytest.approx(10 * math.log10(4))
+    assert metrics.relative_l2(image, reference).item() == pytest.approx(2.0)
+    # Without variance only the luminance term is left, c1 = 1e-4.
+    assert metrics.ssim(image, reference) == pytest.approx((2 * 3 / 16 + 1e-4) / (10 / 16 + 1e-4), rel=1e-12)
+    noise = rng.random((12, 12, 1))
+    assert metrics.ssim(noise, noise) == pytest.approx(1.0)
+    assert_close(metrics.heatmap(tensor([0.0, 1.0, math.nan]), high=2.0)[2], [0.0, 1.0, 0.0], ulps=0)
+    # The middle of the scale is (188, 55, 84) in sRGB.
+    middle = [((c / 255 + 0.055) / 1.055) ** 2.4 for c in (188, 55, 84)]
+    assert_close(metrics.heatmap(tensor([1.0]), high=2.0), tensor([middle]), ulps=TIGHT)
+
+
+def test_normals_of_a_tetrahedron():
+    """Three legs along the axes: the normals of its faces are -x, -y, -z of area 1/2, and (1, 1, 1)/2 of area √3/2."""
+    vertices = tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    faces = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    third = math.sqrt(1 / 3)
+    # At the tips two legs' faces and the oblique one add up: (1, 1, 1) - (0, 1, 1) for the tip on x.
+    expected = tensor([[-third, -third, -third], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    assert_close(vertex_normals(vertices, faces), expected, ulps=8)
+
+
+def test_frames_of_a_sequence_turn_with_the_mesh(rng):
+    vertices, faces = tensor(rng.normal(size=(4, 3))), torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    turn = tensor(rotations(rng, 2))
+    moved = torch.einsum("fij,vj->fvi", turn, vertices)
+    frames = make_mesh_sequence(moved, faces, tensor(np.zeros((2, 1)))).frames
+    assert_close(frames[1], turn[1] @ turn[0].T @ frames[0], ulps=TIGHT)
