@@ -118,11 +118,13 @@ def test_a_model_that_does_not_fit_is_refused_in_one_line(run, tmp_path, capsys,
     assert not (tmp_path / "film").exists() or not list((tmp_path / "film").iterdir())
 
 
-def test_the_readme_example_runs_as_printed(run, monkeypatch):
-    (block,) = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
+def test_the_readme_examples_run_as_printed(run, monkeypatch):
+    relit, raster = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
     monkeypatch.chdir(run)
     names: dict = {}
-    exec(block, names)
+    exec(raster, names)
+    assert names["values"].shape == names["duv_dx"].shape == (64, 64, 4, 2)
+    exec(relit, names)
     positions, colors = np.asarray(names["positions"]), np.asarray(names["colors"])
     assert positions.shape == colors.shape == (3273, 3)
     assert np.isfinite(colors).all() and colors.max() > 0.05
