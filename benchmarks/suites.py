@@ -16,7 +16,7 @@ from typing import Protocol, cast
 from jaxrender import checks
 
 #: Suite name -> module. Imported when it is asked for, since suites import the libraries they compare with.
-SUITES: Mapping[str, str] = MappingProxyType({"harmonics": "benchmarks.harmonics"})
+SUITES: Mapping[str, str] = MappingProxyType({"harmonics": "benchmarks.harmonics", "raster": "benchmarks.raster"})
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,114 @@
+"""The rasteriser: ids and depth, all attributes of a G-buffer, and a shaded picture, beside Mesa's llvmpipe.
+
+The scene is Sponza where `../shared/data` has it, else the built-in one with many vertices. Cases:
+
+- `ids`: triangle, depth and barycentrics of every sample; llvmpipe writes ids and depth.
+- `gbuffer`: all of `GBuffer` (21 floats, 2 ids); llvmpipe writes ids, depth and three vec4.
+- `shaded`: textures, masks and a light; no peer.
+- `triangle_size`: a grid of equal triangles over the image, from 2 to 512 pixels each.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import llvmpipe
+from benchmarks.suites import Measurement, Options
+from benchmarks.timing import measure, measure_alternating
+from jaxrender import console
+from jaxrender.camera import Camera, clip_from_world, depth_range
+from jaxrender.deferred import make_gbuffer, rasterize, render_scene, scene_textures
+from jaxrender.io import load_scene
+from jaxrender.io.builtin_scene import builtin_scene
+from jaxrender.machine import keep_xla_to_one_thread
+from jaxrender.scene import Scene, scene_bounds, whole_scene_camera
+
+SPONZA = Path(__file__).resolve().parents[2] / "shared" / "data" / "sponza" / "Sponza.gltf"
+SIZES, QUICK_SIZES = ((768, 1024), (3072, 4096)), ((192, 256),)
+TRIANGLE_SIZES_PX = (2, 8, 32, 128, 512)
+Params = dict[str, str | int | float | bool]
+
+
+def run(options: Options) -> Iterator[Measurement]:
+    """The cases in the order of the stages."""
+    keep_xla_to_one_thread()
+    sizes = QUICK_SIZES if options.quick else SIZES
+    if any(options.wants(case) for case in ("ids", "gbuffer", "shaded")):
+        scene, camera, name = _scene()
+        for height, width in sizes:
+            yield from _of_scene(scene, camera, name, height, width, options)
+    if options.wants("triangle_size"):
+        yield from _triangle_sizes(*sizes[0], options)
+
+
+def _scene() -> tuple[Scene, Camera, str]:
+    if not SPONZA.is_file():
+        scene = builtin_scene(num_vertices=40_000)
+        return scene, whole_scene_camera(scene, aspect=4 / 3), "built-in"
+    eye, target, up = (jnp.asarray(v) for v in ([10.0, 2.0, 0.0], [-5.0, 3.0, 0.0], [0.0, 1.0, 0.0]))
+    return load_scene(SPONZA), Camera(eye, target, up, jnp.float32(np.radians(60.0))), "Sponza"
+
+
+def _of_scene(scene, camera, name: str, height: int, width: int, options: Options) -> Iterator[Measurement]:
+    near, far = depth_range(camera, *scene_bounds(scene))
+    matrix = clip_from_world(camera, height=height, width=width, near=near, far=far)
+    clip = jnp.concatenate([scene.positions, jnp.ones_like(scene.positions[:, :1])], axis=1) @ matrix.T
+    params: Params = {"scene": name, "height": height, "width": width, "triangles": len(scene.faces), "cull": "back"}
+    ids = lambda: rasterize(clip, scene.faces, height=height, width=width, cull="back")  # noqa: E731
+    if options.wants("ids"):
+        peer = _peer(clip, scene.faces, height, width, body="", num_targets=0)
+        yield from _beside("ids", ids, peer, params)
+    full = jax.jit(make_gbuffer)
+    if options.wants("gbuffer"):
+        whole = lambda: full(scene, ids())  # noqa: E731
+        peer = _peer(clip, scene.faces, height, width, values=np.ones((len(clip), 4), np.float32))
+        yield from _beside("gbuffer", whole, peer, params)
+    if options.wants("shaded") and height * width <= 1024 * 1024:
+        textures = scene_textures(scene)
+        draw = lambda: render_scene(scene, camera, height=height, width=width, textures=textures).image  # noqa: E731
+        yield Measurement("shaded", "jaxrender", measure(draw, min_runs=3).metrics(), params)
+
+
+def _peer(clip, faces, height: int, width: int, **options) -> llvmpipe.Drawing | None:
+    try:
+        return llvmpipe.Drawing(np.asarray(clip), np.asarray(faces), height=height, width=width, **options)
+    except llvmpipe.NoOpenGL as error:
+        console.announce(f"raster: {error}; its rows are left out")
+        return None
+
+
+def _beside(
+    case: str, ours: Callable[[], object], peer: llvmpipe.Drawing | None, params: Params
+) -> Iterator[Measurement]:
+    variants: dict[str, Callable[[], object]] = {"jaxrender": ours}
+    if peer is not None:
+        variants["llvmpipe"] = lambda: peer.draw(cull="back")
+    for variant, timing in measure_alternating(variants, min_runs=5).items():
+        yield Measurement(case, variant, timing.metrics(), params)
+    if peer is not None:
+        peer.release()
+
+
+def _triangle_sizes(height: int, width: int, options: Options) -> Iterator[Measurement]:
+    for pixels in TRIANGLE_SIZES_PX:
+        clip, faces = _grid(height, width, pixels)
+        params: Params = {"height": height, "width": width, "triangles": len(faces), "pixels_per_triangle": pixels}
+        draw = lambda clip=clip, faces=faces: rasterize(clip, faces, height=height, width=width)  # noqa: E731
+        found = measure(draw, min_runs=5).metrics()
+        found["triangles_per_second"] = 1e3 * len(faces) / found["ms_median"]
+        yield Measurement("triangle_size", "jaxrender", found, params)
+
+
+def _grid(height: int, width: int, pixels: int):
+    """Right triangles of about so many pixels, two a cell, at one depth."""
+    side = np.sqrt(2.0 * pixels)
+    rows, columns = max(1, round(height / side)), max(1, round(width / side))
+    x, y = np.meshgrid(np.linspace(-1, 1, columns + 1), np.linspace(-1, 1, rows + 1))
+    clip = np.stack([x, y, np.full_like(x, 0.5), np.ones_like(x)], axis=-1).reshape(-1, 4)
+    a = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
+    quads = np.stack([a[:-1, :-1], a[:-1, 1:], a[1:, 1:], a[1:, :-1]], axis=-1).reshape(-1, 4)
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    return jnp.asarray(clip, jnp.float32), jnp.asarray(faces, jnp.int32)
