@@ -86,7 +86,13 @@ def _sample_range(xy: Int[Array, "n 3 2"], grid: TileGrid, samples: Samples):
 
 
 def spans(
-    triangles: ScreenTriangles, grid: TileGrid, samples: Samples, *, first_row, num_rows, max_spans: int
+    triangles: ScreenTriangles,
+    grid: TileGrid,
+    samples: Samples,
+    *,
+    first_row: Int[Array, " n"],
+    num_rows: Int[Array, " n"],
+    max_spans: int,
 ) -> Spans:
     """The run of tiles of each triangle in each of its rows; at most `max_spans` of them."""
     item, step, used = _expand(num_rows, max_spans)

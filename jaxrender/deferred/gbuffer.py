@@ -3,7 +3,9 @@
 Differentiable in the scene's positions, normals, colors and uv for fixed fragments (see `interpolate`).
 """
 
+import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,9 @@ from jaxrender.deferred.raster import Fragments
 from jaxrender.deferred.texture import Textures, sample_texture_grad
 from jaxrender.scene import Scene
 from jaxrender.vecmath import normalize
+
+#: Rows of the image that are interpolated at a time.
+ROWS_PER_BAND = 8
 
 
 @jax.tree_util.register_dataclass
@@ -48,7 +53,7 @@ class GBuffer:
 
 
 def make_gbuffer(
-    scene: Scene, fragments: Fragments, textures: Textures | None = None, *, max_anisotropy: int = 8
+    scene: Scene, fragments: Fragments, *, textures: Textures | None = None, max_anisotropy: int = 8
 ) -> GBuffer:
     """Interpolates the scene's attributes at all samples.
 
@@ -56,16 +61,41 @@ def make_gbuffer(
       textures: of the scene's images; without them there are no normal maps.
       max_anisotropy: taps of a normal map's lookup.
     """
+    h, band = fragments.triangle_id.shape[0], ROWS_PER_BAND
+
+    attributes = jnp.concatenate([scene.positions, scene.normals, scene.tangents, scene.uv, scene.colors], axis=-1)
+    corners = scene.positions[scene.faces]
+    flat = normalize(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+
+    def some_rows(fields: dict[str, Any]) -> GBuffer:
+        own = dataclasses.replace(fragments, **fields)
+        return _interpolated(scene, own, textures, attributes, flat, max_anisotropy=max_anisotropy)
+
+    # Band by band: what a band gathers stays in a processor's cache.
+    names = ("triangle_id", "screen_id", "barycentrics", "depth", "w")
+    fields = {name: _in_bands(getattr(fragments, name), band, -1 if name.endswith("_id") else 0) for name in names}
+    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:h], jax.lax.map(some_rows, fields))
+
+
+def _in_bands(image: Array, band: int, empty: int) -> Array:
+    """Rows in groups of `band`, filled up with empty ones."""
+    h, *rest = image.shape
+    padding = [(0, -h % band), *((0, 0) for _ in rest)]
+    return jnp.pad(image, padding, constant_values=empty).reshape(-1, band, *rest)
+
+
+def _interpolated(
+    scene: Scene, fragments: Fragments, textures: Textures | None, attributes: Float[Array, "v 16"],
+    flat: Float[Array, "t 3"], *, max_anisotropy: int,
+) -> GBuffer:  # fmt: skip
+    """All fields for some rows of an image, from all vertex attributes side by side and the triangles' normals."""
     weights = corner_weights(fragments)
-    whole = jnp.concatenate([scene.positions, scene.normals, scene.tangents, scene.uv, scene.colors], axis=-1)
-    values = blend(fragments, whole, weights)
+    values = blend(fragments, attributes, weights)
     position, normal, tangent, uv, color = jnp.split(values, [3, 6, 10, 12], axis=-1)
     duv_dx, duv_dy = attribute_gradients(fragments, scene.uv)
     covered = fragments.coverage
     triangle = jnp.maximum(fragments.triangle_id, 0)
     material_id = jnp.where(covered, scene.material_id[triangle], -1)
-    corners = scene.positions[scene.faces]
-    flat = normalize(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     # The back of a surface is seen only where it has two sides; there its normals are turned over.
     side = jnp.where(fragments.triangles.front[jnp.maximum(fragments.screen_id, 0)], 1.0, -1.0)[..., None]
     normal = normalize(normal)

@@ -33,8 +33,9 @@ def scene_textures(scene: Scene) -> Textures | None:
     )
 
 
-def default_lights(dtype=jnp.float32) -> tuple[Lights, Float[Array, "3 9"]]:
+def default_lights() -> tuple[Lights, Float[Array, "3 9"]]:
     """A warm sun from above and a blue sky over brown ground, for scenes that bring no light."""
+    dtype = jnp.float32
     sun = jnp.asarray([[-0.35, -1.0, -0.25]], dtype)
     one = jnp.ones(1, dtype)
     lights = Lights(
@@ -142,7 +143,7 @@ def render_scene(
 
 @functools.partial(jax.jit, static_argnames="max_anisotropy")
 def _shaded(scene, fragments, textures, lights, ambient, eye, max_anisotropy):
-    gbuffer = make_gbuffer(scene, fragments, textures, max_anisotropy=max_anisotropy)
+    gbuffer = make_gbuffer(scene, fragments, textures=textures, max_anisotropy=max_anisotropy)
     surface = look_up_surface(gbuffer, scene.material, textures, max_anisotropy=max_anisotropy)
     radiance = shade(gbuffer, surface, lights, eye, ambient=ambient)
     share = jnp.mean(gbuffer.coverage.astype(jnp.float32), axis=-1)

@@ -90,6 +90,7 @@ class Demand:
     pairs: Int[Array, ""]
 
     def exceeds(self, budget: Budget) -> Bool[Array, ""]:
+        """Whether something was left out for want of room."""
         return (self.clipped > budget.max_clipped) | (self.spans > budget.max_spans) | (self.pairs > budget.max_pairs)
 
 
@@ -179,6 +180,7 @@ def fill_strips(
     lists: TileLists,
     strips: Int[Array, " k"],
     plan: _Plan,
+    *,
     beyond: Float[Array, "rows columns s"] | None = None,
 ) -> Cells:
     """Runs the depth test over some strips of the image; cells (k, rows, columns, s).
@@ -385,7 +387,7 @@ def rasterize(
     )
     limits = None if beyond is None else _cells_of(beyond, plan, samples)
     fill = lambda own: jax.block_until_ready(  # noqa: E731
-        _fill(triangles, lists, jnp.asarray(own, jnp.int32), plan, limits)
+        _fill(triangles, lists, jnp.asarray(own, jnp.int32), plan, beyond=limits)
     )
     with ThreadPoolExecutor(num_cores() if on_cpu else 1) as threads:
         filled = list(threads.map(fill, parts))

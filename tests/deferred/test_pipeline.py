@@ -36,7 +36,7 @@ def embree_hits(scene, camera):
 def test_the_gbuffer_is_what_rays_see(scene):
     camera = whole_scene_camera(scene, aspect=80 / 60)
     fragments, left = see(scene, camera, **SIZE)
-    gbuffer = make_gbuffer(scene, fragments, scene_textures(scene))
+    gbuffer = make_gbuffer(scene, fragments, textures=scene_textures(scene))
     hits, places = embree_hits(scene, camera)
     ids = np.asarray(gbuffer.triangle_id).reshape(-1)
     assert left == 0
