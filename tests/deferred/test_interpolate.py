@@ -1,14 +1,18 @@
 """Interpolation modes, the pull model and gradients, against float64 planes and finite differences."""
 
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrender.deferred import interpolate as ip
 from jaxrender.deferred.raster import rasterize
 from jaxrender.deferred.samples import CENTER, ordered_grid, standard_pattern
 from tests.deferred.oracle import snap
+
+# The package has a function of that name.
+ip = importlib.import_module("jaxrender.deferred.interpolate")
 
 SIZE = {"height": 20, "width": 24}
 NDC = np.array([(-0.8, -0.7), (0.9, -0.4), (-0.1, 0.85), (0.95, 0.9)])

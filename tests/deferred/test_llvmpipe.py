@@ -96,8 +96,8 @@ def test_sponza(shared_data):
     mine, my_depth = np.asarray(ours.triangle_id)[..., 0], np.asarray(ours.depth)[..., 0]
     differ = mine != ids
     assert (mine >= 0).mean() > 0.9
-    # Sponza has coplanar decals: ties of depth, which each side decides within its rounding.
-    ties = differ & (np.abs(my_depth - depth) < 1e-6)
+    # Sponza has coplanar decals: ties of depth, which each side decides within the rounding of its plane near 1.
+    ties = differ & (np.abs(my_depth - depth) < 1e-5)
     assert differ.mean() < 1e-3
     assert (differ & ~ties).sum() <= 10
 

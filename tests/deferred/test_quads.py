@@ -1,18 +1,21 @@
 """Quads against brute force over exact coverage, hand-counted triangles, and derivatives of planes."""
 
 import functools
+import importlib
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrender.deferred import interpolate as ip
 from jaxrender.deferred import quads as q
 from jaxrender.deferred.raster import rasterize
 from jaxrender.deferred.samples import CENTER, ordered_grid, standard_pattern
 from tests.deferred import oracle
 from tests.deferred.test_raster import ndc, perspective, soup
+
+# The package has a function of that name.
+ip = importlib.import_module("jaxrender.deferred.interpolate")
 
 LAYOUTS = {"center": CENTER, "grid3": ordered_grid(3), "msaa8": standard_pattern(8)}
 # Compiling is nearly all of the time here.

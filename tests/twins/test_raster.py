@@ -1,17 +1,21 @@
 """The rasteriser and the interpolation modes against their twins: a loop over triangles, planes solved in float64."""
 
+import importlib
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
 
-from jaxrender.deferred import interpolate as ours
 from jaxrender.deferred import raster
 from jaxrender.deferred import samples as layouts
 from tests.deferred.test_raster import perspective, soup
 from torchref.deferred import interpolate as theirs
 from torchref.deferred import raster as twin
 from torchref.deferred import samples as twin_layouts
+
+# The package has a function of that name.
+ours = importlib.import_module("jaxrender.deferred.interpolate")
 
 LAYOUTS = {"center": ("ordered_grid", 1), "grid": ("ordered_grid", 3), "msaa4": ("standard_pattern", 4)}
 
