@@ -230,6 +230,7 @@ def _track(items, count, label):
 
 def _evaluate(character: Character, result: "TrainResult", settings: TrainSettings, *, study: bool) -> "Evaluation":
     from fitting.evaluate import evaluate
+    from fitting.features import joint_angle_features
 
     assert result.motion is not None  # a character always has one
     console.announce("evaluating ...")
@@ -257,14 +258,6 @@ def _report(
         pictures = draw_pictures(character, result.motion, result.model, evaluation, out)
     report = write_report(out, result, settings, evaluation, model_path, pictures)
     return [numbers, *(path for path, _ in pictures), report]
-
-
-def joint_angle_features(character: Character, motion):
-    """Exponential-map features of the same frames, for the study."""
-    from fitting.features import all_raw_features, unfitted_basis
-
-    basis = unfitted_basis(character, motion, "exponential_map", np.zeros(1, np.int32))
-    return all_raw_features(basis, character, motion), basis
 
 
 def run_demo(options) -> None:

@@ -78,6 +78,12 @@ def all_raw_features(basis: FeatureBasis, character: Character, motion: Motion) 
     return np.stack([np.asarray(one(jax.tree.map(lambda values, i=i: values[i], motion.pose))) for i in frames])
 
 
+def joint_angle_features(character: Character, motion: Motion) -> tuple[Float[np.ndarray, "f 1 n"], FeatureBasis]:
+    """Exponential-map features of every frame, one group for all points, and their unfitted basis."""
+    basis = unfitted_basis(character, motion, "exponential_map", np.zeros(1, np.int32))
+    return all_raw_features(basis, character, motion), basis
+
+
 def fit_basis(
     basis: FeatureBasis, raw: Float[np.ndarray, "f g n"], weights: Float[np.ndarray, " f"], num_components: int
 ) -> tuple[FeatureBasis, Float[np.ndarray, "g k"]]:

@@ -22,6 +22,7 @@ from fitting.solve import (
     lobe_metric,
     lobe_targets,
     mean_residual,
+    padded,
     refine_block,
     solve_linear,
     synthesize,
@@ -37,22 +38,23 @@ NUM_STARTS = 3
 
 @dataclass(frozen=True)
 class Block:
-    """Up to BLOCK points of one group, padded with repetitions of the last."""
+    """Up to `size` points of one group; `padded` has exactly so many."""
 
     group: int
     points: Int[np.ndarray, " n"]
+    size: int
 
     @property
-    def padded(self) -> Int[np.ndarray, " block"]:
-        return np.concatenate([self.points, np.repeat(self.points[-1:], BLOCK - len(self.points))])
+    def padded(self) -> Int[np.ndarray, " size"]:
+        return padded(self.points, self.size)
 
 
-def blocks(groups: Int[np.ndarray, " p"], points: Int[np.ndarray, " n"]) -> list[Block]:
+def blocks(groups: Int[np.ndarray, " p"], points: Int[np.ndarray, " n"], *, size: int = BLOCK) -> list[Block]:
     """The points cut into blocks of one group each."""
     cut = []
     for g in np.unique(groups[points]):
         own = points[groups[points] == g]
-        cut += [Block(int(g), own[i : i + BLOCK]) for i in range(0, len(own), BLOCK)]
+        cut += [Block(int(g), own[i : i + size], size) for i in range(0, len(own), size)]
     return cut
 
 
@@ -110,7 +112,7 @@ def fit_block(
     Several greedy starts are refined for a third of the steps, the best of each point goes on for two rounds, each
     with the metric of where it stands.
     """
-    starts = _starts(sh, num_lobes=fit.num_lobes, count=NUM_STARTS if fit.refine_steps else 1)
+    starts = start_axes(sh, num_lobes=fit.num_lobes, count=NUM_STARTS if fit.refine_steps else 1)
     best: Any = None
     for axes in starts:
         weights = _initial(rows, sh, axes)
@@ -131,7 +133,7 @@ def fit_block(
     return np.asarray(weights), np.asarray(axes), np.asarray(offset)
 
 
-_starts = jax.jit(functools.partial(spread_start_axes, order=ORDER), static_argnames=("num_lobes", "count"))
+start_axes = jax.jit(functools.partial(spread_start_axes, order=ORDER), static_argnames=("num_lobes", "count"))
 _initial = jax.jit(lambda rows, sh, axes: solve_linear(rows, lobe_targets(sh, axes)))
 _refine_jit = jax.jit(refine_block, static_argnames=("num_steps", "offset"))
 

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Int
 from fitting.config import FitSettings
 from fitting.features import fit_basis
 from fitting.motion import TRAIN
-from fitting.training_data import TrainingData, project
+from fitting.training_data import TrainingData
 
 RIDGES = tuple(10.0 ** (-0.5 * i) for i in range(8, -1, -1))
 
@@ -23,7 +23,7 @@ def choose_ridge(data: TrainingData, fit: FitSettings, *, max_points: int = 1200
     folds = held_out_folds(data)
     if not folds:
         return RIDGES[len(RIDGES) // 2]
-    sh = project(data.bits, points, data.table)
+    sh = data.sh(points)
     scores = np.zeros((len(folds), len(RIDGES)))
     totals = np.zeros(len(folds))
     basis, _ = fit_basis(data.basis, data.raw, weights, fit.num_components)

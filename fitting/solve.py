@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 from jaxrender.harmonics.pose_model import lobes_from_numbers
 from jaxrender.harmonics.visibility import project_visibility
@@ -20,6 +20,11 @@ from jaxrender.harmonics.zh_fit import solve_lobe_coefficients
 
 BLOCK = 64
 ORDER = 4
+
+
+def padded(rows: Shaped[np.ndarray, "n *b"], size: int) -> Shaped[np.ndarray, "size *b"]:
+    """Up to `size` rows, filled up with repetitions of the last: one compiled function then serves all blocks."""
+    return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)])
 
 
 @jax.tree_util.register_dataclass

@@ -22,9 +22,9 @@ from fitting.dataset import (
     represent_by_visible,
     sequence_frames,
 )
-from fitting.features import all_raw_features, feature_groups, unfitted_basis
+from fitting.features import all_raw_features, feature_groups, joint_angle_features, unfitted_basis
 from fitting.motion import MIXED, SEGMENT, TRAIN, Motion, sample_motion
-from fitting.solve import BLOCK, ORDER, block_sh
+from fitting.solve import BLOCK, ORDER, block_sh, padded
 from fitting.stages import Track, no_tracking
 from jaxrender.animation.skinning import Character
 from jaxrender.checks import bad_input
@@ -66,7 +66,7 @@ class TrainingData:
 
     def sh(self, points: Int[np.ndarray, " n"]) -> Float[np.ndarray, "f n 16"]:
         """Baked SH visibility of some points in all frames."""
-        return np.asarray(block_sh(self.bits[:, points], self.table))
+        return project(self.bits, points, self.table)
 
 
 def project(
@@ -76,8 +76,7 @@ def project(
     result = np.empty((len(bits), len(points), table.shape[1]), np.float32)
     for start in range(0, len(points), BLOCK):
         own = points[start : start + BLOCK]
-        padded = np.concatenate([own, np.repeat(own[-1:], BLOCK - len(own))])
-        result[:, start : start + len(own)] = np.asarray(block_sh(bits[:, padded], table))[:, : len(own)]
+        result[:, start : start + len(own)] = np.asarray(block_sh(bits[:, padded(own, BLOCK)], table))[:, : len(own)]
     return result
 
 
@@ -103,20 +102,18 @@ def bake_character(
     return dataclasses.replace(data, points=points, source=motion.source), statistics, motion
 
 
-def check_pose_rank(character: Character, motion: Motion) -> int:
-    """Rank of the matrix of joint angles over the training frames.
+def check_pose_rank(character: Character, motion: Motion) -> None:
+    """Raises InputError if the matrix of joint angles over the training frames has a rank below 2.
 
-    Raises:
-      InputError: if it is below 2. A single motion of a single joint teaches nothing about any other pose.
+    A single motion of a single joint teaches nothing about any other pose.
     """
-    angles = unfitted_basis(character, motion, "exponential_map", np.zeros(1, np.int32))
-    rows = all_raw_features(angles, character, motion)[motion.part == TRAIN, 0].astype(np.float64)
+    angles, _ = joint_angle_features(character, motion)
+    rows = angles[motion.part == TRAIN, 0].astype(np.float64)
     rank = int(np.linalg.matrix_rank(rows - rows.mean(axis=0), tol=1e-4 * np.sqrt(rows.size)))
     if rank < 2:
         bad_input(
             character.name, "poses", expected="joint angles of rank 2 or more over the frames", got=f"rank {rank}"
         )
-    return rank
 
 
 def bake_sequence(

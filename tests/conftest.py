@@ -1,6 +1,7 @@
 """Strict settings for every test, and the fixtures that several folders share."""
 
 import pathlib
+from collections.abc import Iterator
 
 import jax
 import numpy as np
@@ -28,3 +29,17 @@ def shared_data() -> pathlib.Path:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20081)
+
+
+@pytest.fixture
+def x64():
+    """The test runs in float64."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request) -> Iterator[np.dtype]:
+    """The test runs in either precision."""
+    with jax.enable_x64(request.param == "float64"):
+        yield np.dtype(request.param)

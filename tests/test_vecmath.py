@@ -16,12 +16,6 @@ frame_from_normal_tangent = jax.jit(vecmath.frame_from_normal_tangent)
 reflection_frame = jax.jit(vecmath.reflection_frame)
 
 
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
-
-
 def unit_vectors(rng, n):
     """Random ones after the axes, and some next to the pole where a frame is singular."""
     v = np.concatenate(

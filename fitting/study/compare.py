@@ -7,7 +7,7 @@ from jaxtyping import Int
 
 from fitting.config import FitSettings
 from fitting.errors import SH, ByPart
-from fitting.fit import model_components, predict_sh
+from fitting.fit import blocks, model_components, predict_sh
 from fitting.ridge import some_points
 from fitting.stages import Track, no_tracking
 from fitting.study.features import Angles, angle_rows, gains, ridge_curve, with_angles
@@ -16,7 +16,6 @@ from fitting.study.ground import Ground, MethodRow, linear_pose, make_ground, me
 from fitting.study.lobes import (
     LOBE_COUNTS,
     STUDY_BLOCK,
-    group_blocks,
     lobe_rows,
     paper_label,
     point_axes,
@@ -110,7 +109,7 @@ def _subset(
     ground: Ground, refined: dict[int, SH], axes: dict[int, np.ndarray], angles: Angles | None, track: Track
 ) -> tuple[Ground, dict[tuple[int, bool], SH], list[MethodRow]]:
     """`subset_rows` on whole blocks of points, spread over the groups; and their ground and refined predictions."""
-    found = group_blocks(ground.data.groups, STUDY_BLOCK)
+    found = [block.points for block in blocks(ground.data.groups, ground.all_points, size=STUDY_BLOCK)]
     count = max(1, SUBSET_POINTS // STUDY_BLOCK)
     some = np.sort(np.concatenate(sorted(found, key=len)[-2 * count :][::2]))
     fit = ground.fit

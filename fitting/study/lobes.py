@@ -8,16 +8,15 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from fitting.errors import SH
-from fitting.fit import fit_block, predict_block
-from fitting.solve import ORDER, lobe_targets, synthesize
+from fitting.fit import Block, blocks, fit_block, predict_block, start_axes
+from fitting.solve import ORDER, lobe_targets, padded, synthesize
 from fitting.stages import Track
 from fitting.study.ground import Ground, LinearPose, MethodRow, method_row
 from jaxrender.harmonics.pose_model import lobes_from_numbers
 from jaxrender.harmonics.zh import lobes_to_sh
-from jaxrender.harmonics.zh_fit import spread_start_axes
 from jaxrender.machine import num_cores
 
 LOBE_COUNTS = (1, 2, 3)
@@ -30,8 +29,7 @@ def in_blocks(function: Callable, *arrays: np.ndarray, size: int = 1024):
 
     def one(start: int):
         rows = [array[start : start + size] for array in arrays]
-        padded = [np.concatenate([r, np.repeat(r[-1:], size - len(r), axis=0)]) for r in rows]
-        return np.asarray(function(*padded))[: len(rows[0])]
+        return np.asarray(function(*(padded(r, size) for r in rows)))[: len(rows[0])]
 
     with ThreadPoolExecutor(num_cores()) as threads:
         return np.concatenate(list(threads.map(one, range(0, len(arrays[0]), size))))
@@ -39,7 +37,6 @@ def in_blocks(function: Callable, *arrays: np.ndarray, size: int = 1024):
 
 _from_charts = jax.jit(synthesize)
 _fixed_axis_numbers = jax.jit(lobe_targets)
-_start_axes = jax.jit(functools.partial(spread_start_axes, order=ORDER), static_argnames=("num_lobes", "count"))
 
 
 @jax.jit
@@ -103,7 +100,7 @@ def _from_angles(numbers):
 
 def point_axes(ground: Ground, num_lobes: int) -> Float[np.ndarray, "n c 3"]:
     """One set of axes per point for all its training frames: the best of several matching pursuits."""
-    starts = np.asarray(_start_axes(ground.sh[ground.train], num_lobes=num_lobes, count=6))
+    starts = np.asarray(start_axes(ground.sh[ground.train], num_lobes=num_lobes, count=6))
     errors = []
     for axes in starts:
         fitted = np.asarray(_from_charts(_fixed_axis_numbers(ground.sh, axes), axes))
@@ -117,7 +114,7 @@ def free_fits(sh: Float[np.ndarray, "n 16"], num_lobes: int) -> Float[np.ndarray
 
     def block(rows):
         found = []
-        for start in np.asarray(_start_axes(rows[None], num_lobes=num_lobes, count=2)):
+        for start in np.asarray(start_axes(rows[None], num_lobes=num_lobes, count=2)):
             numbers = fit_rows(rows, start, penalty=penalty)
             error = np.sum((np.asarray(_linearize(numbers, start)[0]) - rows) ** 2, axis=-1)
             found.append((np.asarray(_angles_from_charts(numbers, start)), error))
@@ -158,26 +155,18 @@ def refined_lobes(ground: Ground, num_lobes: int, *, offset: bool, track: Track)
     """The training proper (fit_block) for another number of lobes, in blocks small enough for a few points a group."""
     fit = dataclasses.replace(ground.fit, num_lobes=num_lobes, offset=offset)
     linear, used, result = ground.linear, ground.linear.weights > 0, np.empty_like(ground.sh)
-    todo = group_blocks(ground.data.groups, STUDY_BLOCK)
+    todo = blocks(ground.data.groups, ground.all_points, size=STUDY_BLOCK)
 
-    def solve(own: Int[np.ndarray, " n"]) -> SH:
-        padded = np.concatenate([own, np.repeat(own[-1:], STUDY_BLOCK - len(own))])
-        rows = linear.rows(int(ground.data.groups[own[0]]))
-        weights, axes, constant = fit_block(rows, ground.sh[used][:, padded], fit)
-        components = linear.components[:, ground.data.groups[own[0]]].astype(np.float32)
-        return np.asarray(predict_block(components, weights, axes, constant))[:, : len(own)]
+    def solve(block: Block) -> SH:
+        fitted = fit_block(linear.rows(block.group), ground.sh[used][:, block.padded], fit)
+        components = linear.components[:, block.group].astype(np.float32)
+        return np.asarray(predict_block(components, *fitted))[:, : len(block.points)]
 
     with ThreadPoolExecutor(num_cores()) as threads:
         solved = threads.map(solve, todo)
-        for own in track(iter(todo), len(todo), count_lobes(num_lobes)):
-            result[:, own] = next(solved)
+        for block in track(iter(todo), len(todo), count_lobes(num_lobes)):
+            result[:, block.points] = next(solved)
     return result
-
-
-def group_blocks(groups: Int[np.ndarray, " n"], size: int) -> list[Int[np.ndarray, " m"]]:
-    """Points of one group each, up to `size` of them."""
-    owns = [np.flatnonzero(groups == g) for g in np.unique(groups)]
-    return [own[i : i + size] for own in owns for i in range(0, len(own), size)]
 
 
 def raw_label(num_lobes: int) -> str:

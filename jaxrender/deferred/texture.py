@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxrender.checks import bad_input, check_at_least, check_finite, check_last_axis, check_one_of, check_same_shape
+from jaxrender.srgb import decode_srgb
 from jaxrender.vecmath import normalize, safe_div, safe_sqrt
 
 WRAP_MODES = ("repeat", "clamp", "mirror")
@@ -153,7 +154,7 @@ def _checked(image: Shaped[Array | np.ndarray, "_ _ _"], k: int) -> Shaped[Array
 def _linear_rgba(image: Shaped[Array | np.ndarray, "h w c"], srgb: bool) -> Float[Array, "h w 4"]:
     if image.dtype == np.uint8:
         level = np.arange(256) / 255.0
-        light = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4) if srgb else level
+        light = decode_srgb(level) if srgb else level
         pixels = np.asarray(image)
         image = np.concatenate([light[pixels[..., :3]], level[pixels[..., 3:]]], axis=-1)
     linear = jnp.asarray(image, dtype=float)

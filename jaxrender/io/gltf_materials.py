@@ -21,6 +21,7 @@ from jaxrender.io.gltf_textures import (
     uv_transform,
     wrap_codes,
 )
+from jaxrender.srgb import decode_srgb
 
 
 def read_albedo(
@@ -59,8 +60,8 @@ def sample_bilinear(
     height, width = image.shape[:2]
     x0, x1, fx = _texels(uv[:, 0].astype(np.float64), width, wrap_u)
     y0, y1, fy = _texels(uv[:, 1].astype(np.float64), height, wrap_v)
-    upper = (1.0 - fx) * _linear_from_srgb(image[y0, x0]) + fx * _linear_from_srgb(image[y0, x1])
-    lower = (1.0 - fx) * _linear_from_srgb(image[y1, x0]) + fx * _linear_from_srgb(image[y1, x1])
+    upper = (1.0 - fx) * decode_srgb(image[y0, x0] / 255.0) + fx * decode_srgb(image[y0, x1] / 255.0)
+    lower = (1.0 - fx) * decode_srgb(image[y1, x0] / 255.0) + fx * decode_srgb(image[y1, x1] / 255.0)
     return (1.0 - fy) * upper + fy * lower
 
 
@@ -91,9 +92,3 @@ def _texels(u: np.ndarray, size: int, wrap: int | None) -> tuple[np.ndarray, np.
     else:
         pair = np.mod(pair, size)
     return pair[0], pair[1], (x - below)[:, None]
-
-
-def _linear_from_srgb(texels: np.ndarray) -> np.ndarray:
-    """The transfer function of IEC 61966-2-1, from 8 bits to [0, 1]."""
-    c = texels.astype(np.float64) / 255.0
-    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

@@ -16,9 +16,9 @@ from jaxrender.checks import bad_input, check_finite
 from jaxrender.io.gltf_accessors import LARGEST_NUMBER
 from jaxrender.io.gltf_container import printable, read_file
 from jaxrender.io.gltf_scene_materials import plain_materials
-from jaxrender.io.picture import decode_srgb
 from jaxrender.io.surfaces import SceneSurface, merged_scene, no_lights
 from jaxrender.scene import Scene
+from jaxrender.srgb import decode_srgb
 
 #: Reflectance where a file says none.
 _GRAY = (0.8, 0.8, 0.8)

@@ -16,23 +16,13 @@ from jaxtyping import Float, UInt8
 
 from jaxrender import checks
 from jaxrender.io.atomic import atomic_path
+from jaxrender.srgb import decode_srgb, encode_srgb
 
 #: PNG files with more pixels than this are refused before decoding.
 MAX_PIXELS = 2**27
 
 
 # --- Linear light and display bytes
-
-
-def encode_srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear values to sRGB (IEC 61966-2-1), clamped to [0, 1]."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def decode_srgb(srgb: np.ndarray) -> np.ndarray:
-    """sRGB values in [0, 1] to linear ones, the inverse of `encode_srgb`."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def tone_map(image: Float[np.ndarray, "h w 3"], *, exposure_stops: float = 0.0) -> Float[np.ndarray, "h w 3"]:

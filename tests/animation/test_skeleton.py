@@ -26,12 +26,6 @@ def sample_clip(clip, skeleton, times):
     return jax.jit(lambda t: sk.sample_clip(clip, skeleton, t))(times)
 
 
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
-
-
 def unit_quaternions(rng, *shape):
     q = rng.normal(size=(*shape, 4))
     return q / np.linalg.norm(q, axis=-1, keepdims=True)

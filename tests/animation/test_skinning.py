@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxrender.animation import skinning
 from jaxrender.animation.skeleton import Pose, global_matrices, rotation_vector_to_quaternion
+from tests.support import oracles
 from tests.support.asserts import assert_close
 from tests.support.tolerances import ROUNDING
 
@@ -15,16 +16,6 @@ skin_mesh = jax.jit(skinning.skin_mesh)
 transform_normals = jax.jit(skinning.transform_normals)
 
 NUM_JOINTS, PALETTE = 4, (3, 0, 2, 2, 1)
-
-
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
-
-
-def unit(v):
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
 def affine(rng, *shape):
@@ -38,7 +29,7 @@ def random_skin(rng, *, num_vertices=30, num_influences=3, dtype=np.float32):
     weights = rng.uniform(size=(num_vertices, num_influences))
     return skinning.Skin(
         vertices=jnp.asarray(rng.normal(size=(num_vertices, 3)), dtype=dtype),
-        normals=jnp.asarray(unit(rng.normal(size=(num_vertices, 3))), dtype=dtype),
+        normals=jnp.asarray(oracles.unit(rng.normal(size=(num_vertices, 3))), dtype=dtype),
         joint_indices=jnp.asarray(rng.integers(0, len(PALETTE), (num_vertices, num_influences)), dtype=jnp.int32),
         weights=jnp.asarray(weights / weights.sum(-1, keepdims=True), dtype=dtype),
         palette_joints=jnp.asarray(PALETTE, dtype=jnp.int32),
@@ -72,7 +63,7 @@ def test_positions_and_frames_against_loops(rng, dtype, num_influences):
     positions = np.einsum("fvij,vj->fvi", blended[..., :3, :3], vertices) + blended[..., :3, 3]
     assert_close(mesh.positions, positions, ulps=ROUNDING, dtype=dtype)
     inverse_transposes = np.linalg.inv(blended[..., :3, :3]).swapaxes(-1, -2)
-    normals = unit(np.einsum("fvij,vj->fvi", inverse_transposes, np.asarray(skin.normals, dtype=np.float64)))
+    normals = oracles.unit(np.einsum("fvij,vj->fvi", inverse_transposes, np.asarray(skin.normals, dtype=np.float64)))
     # Random matrices have condition numbers up to a few hundred, and cofactors lose as many ulps.
     assert_close(mesh.frames[..., 2], normals, ulps=64 * ROUNDING, dtype=dtype)
 
@@ -120,9 +111,9 @@ def test_rest_pose_is_the_rest_surface(rng):
 def test_normals_stay_orthogonal_to_the_surface_under_any_scale_and_shear(rng, dtype):
     linear = rng.normal(size=(200, 3, 3)) * np.array([1.0, 0.03, 30.0])
     edges = rng.normal(size=(2, 200, 3))
-    normals = unit(np.cross(edges[0], edges[1]))
+    normals = oracles.unit(np.cross(edges[0], edges[1]))
     mapped = transform_normals(jnp.asarray(linear, dtype=dtype), jnp.asarray(normals, dtype=dtype))
-    expected = unit(np.linalg.solve(linear.swapaxes(1, 2), normals[..., None])[..., 0])
+    expected = oracles.unit(np.linalg.solve(linear.swapaxes(1, 2), normals[..., None])[..., 0])
     # Conditioning: axes of 0.03 and 30 put a factor of 1000 on the rounding of the inputs.
     assert_close(mapped, expected, ulps=1000 * ROUNDING, dtype=dtype)
 
@@ -130,7 +121,7 @@ def test_normals_stay_orthogonal_to_the_surface_under_any_scale_and_shear(rng, d
 def test_mirrored_surface_keeps_its_outside():
     mirror = jnp.asarray(np.diag([-2.0, 1.0, 1.0]), dtype=jnp.float32)
     normal = transform_normals(mirror, jnp.asarray([0.6, 0.0, 0.8]))
-    np.testing.assert_allclose(normal, unit(np.array([-0.3, 0.0, 0.8])), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(normal, oracles.unit(np.array([-0.3, 0.0, 0.8])), rtol=0, atol=1e-7)
 
 
 def test_flattened_surface_has_a_normal_and_a_vanished_one_has_none():

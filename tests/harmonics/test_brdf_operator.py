@@ -17,12 +17,6 @@ from tests.support.tolerances import TIGHT
 phong_operator = jax.jit(harmonics.phong_operator, static_argnames="order")
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
 def entry(matrix, name):
     """An entry by hexadecimal row and column."""
     return float(matrix[int(name[0], 16), int(name[1], 16)])

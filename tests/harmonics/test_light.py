@@ -21,22 +21,6 @@ sh_directional_light = jax.jit(harmonics.sh_directional_light, static_argnames="
 WHITE = np.ones(1)
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
-
-
-def unit(v):
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
-
-
 # --- Environment maps
 
 
@@ -134,7 +118,7 @@ def test_rotating_a_map_takes_whole_columns():
 
 def test_directional_light_is_a_point(rng, x64):
     """The coefficients of δ_d are y(d): ∫ δ_d f = f(d)."""
-    d, f = unit(rng.normal(size=3)), rng.normal(size=25)
+    d, f = oracles.unit(rng.normal(size=3)), rng.normal(size=25)
     light = sh_directional_light(d, np.array([2.0, 0.5]), order=5)
     values = oracles.real_harmonics(d, 5) @ f
     assert_close(np.asarray(light) @ f, np.array([2.0, 0.5]) * values, ulps=TIGHT)
@@ -152,7 +136,7 @@ def test_disc_is_the_integral_over_its_cap(radius, order, x64):
 
 
 def test_disc_closed_forms(x64):
-    d = unit(np.array([1.0, -2.0, 0.5]))
+    d = oracles.unit(np.array([1.0, -2.0, 0.5]))
     everywhere = sh_area_light(d, np.array(np.pi), WHITE, order=6)[0]
     assert_close(everywhere, np.sqrt(4 * np.pi) * np.eye(36)[0], ulps=TIGHT)
     half = sh_area_light(d, np.array(np.pi / 2), WHITE, order=6)[0]
@@ -166,14 +150,14 @@ def test_disc_closed_forms(x64):
 @pytest.mark.parametrize("radius", [1e-2, 1e-3, 1e-5])
 def test_small_disc_is_a_lamp_without_cancellation(radius):
     """In float32: solid angle 4π sin²(r/2) times a point, up to (l r)² / 8 in band l."""
-    d = jnp.asarray(unit(np.array([0.3, 0.9, -0.2])), jnp.float32)
+    d = jnp.asarray(oracles.unit(np.array([0.3, 0.9, -0.2])), jnp.float32)
     disc = sh_area_light(d, jnp.asarray(radius, jnp.float32), jnp.ones(1), order=4)
     point = sh_directional_light(d, jnp.full(1, 4 * np.pi * np.sin(radius / 2) ** 2), order=4)
     np.testing.assert_allclose(disc, point, rtol=(4 * radius) ** 2 / 8 + 64 * np.finfo(np.float32).eps, atol=0)
 
 
 def test_disc_gradients(x64):
-    d = unit(np.array([1.0, -2.0, 0.5]))
+    d = oracles.unit(np.array([1.0, -2.0, 0.5]))
     light = functools.partial(sh_area_light, order=5)
     check_grads(light, (d, np.array(0.8), np.array([2.0, 1.0])), order=1, modes=["rev"])
     for radius in (0.0, np.pi):
@@ -183,7 +167,7 @@ def test_disc_gradients(x64):
 
 
 def test_lamps_broadcast(rng):
-    d = jnp.asarray(unit(rng.normal(size=(4, 1, 3))), jnp.float32)
+    d = jnp.asarray(oracles.unit(rng.normal(size=(4, 1, 3))), jnp.float32)
     radiance = jnp.asarray(rng.uniform(size=(1, 2, 3)), jnp.float32)
     points = sh_directional_light(d, radiance, order=3)
     discs = sh_area_light(d, jnp.full((1, 2), 0.3), radiance, order=3)

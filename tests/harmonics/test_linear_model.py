@@ -13,18 +13,6 @@ from tests.support.tolerances import LONG_SUM, TIGHT
 fit_linear = jax.jit(harmonics.fit_linear)
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
-
-
 def closed_form(features, targets, ridge):
     """Weights and bias through the singular values, in float64."""
     scale = features.std(0)

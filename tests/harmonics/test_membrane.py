@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from jax.test_util import check_grads
 
 from jaxrender import harmonics
@@ -12,12 +11,6 @@ from tests.support.asserts import assert_close
 from tests.support.tolerances import TIGHT
 
 membrane_transfer = jax.jit(harmonics.membrane_transfer, static_argnames="order")
-
-
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
 
 
 def test_back_lobe_is_the_printed_table(x64):

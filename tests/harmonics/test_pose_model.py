@@ -14,19 +14,9 @@ from jaxrender import harmonics
 from jaxrender.animation.skeleton import Pose
 from jaxrender.checks import InputError
 from jaxrender.harmonics import pose_model
+from tests.support import oracles
 from tests.support.asserts import assert_close
 from tests.support.tolerances import ROUNDING, TIGHT
-
-
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
-def unit(v):
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
-
 
 # --- Surroundings
 
@@ -117,7 +107,7 @@ def joint_angles(pose, *, euler=False):
 
 
 def random_pose(rng, *lead):
-    q = unit(rng.normal(size=(*lead, NUM_JOINTS, 4)))
+    q = oracles.unit(rng.normal(size=(*lead, NUM_JOINTS, 4)))
     t, s = rng.normal(size=(*lead, NUM_JOINTS, 3)), rng.uniform(0.5, 2.0, size=(*lead, NUM_JOINTS, 3))
     return Pose(jnp.asarray(t), jnp.asarray(q), jnp.asarray(s))
 
@@ -167,7 +157,7 @@ def arrays(seed=0, kind="surroundings"):
 
     return {
         "weights": normal(NUM_COMPONENTS + 1, 6 * NUM_LOBES, NUM_POINTS),
-        "axes": unit(normal(NUM_POINTS, NUM_LOBES, 3)),
+        "axes": oracles.unit(normal(NUM_POINTS, NUM_LOBES, 3)),
         "offset": normal(NUM_POINTS, 16),
         "groups": rng.integers(0, groups, NUM_POINTS).astype(np.int32),
         "points": rng.integers(0, NUM_POINTS, 10).astype(np.int32),

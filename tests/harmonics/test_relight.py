@@ -23,10 +23,7 @@ NUM_VERTICES, NUM_LOBES = 7, 2
 ULPS = 2000
 
 
-@pytest.fixture(autouse=True)
-def x64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 @pytest.fixture

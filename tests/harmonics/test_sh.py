@@ -27,18 +27,6 @@ sh_from_layout = jax.jit(harmonics.sh_from_layout, static_argnames="layout")
 
 
 @pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
-
-
-@pytest.fixture
 def directions(rng):
     """The poles and the other axes, some directions next to the poles, and random ones."""
     near = [[1e-7, 0, 1], [1e-4, 1e-4, -1]]

@@ -25,22 +25,6 @@ solve = jax.jit(functools.partial(harmonics.solve_lobe_coefficients, order=ORDER
 quickly = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
-
-
-def unit(v):
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
-
-
 def lobes(coefficients, axes):
     return np.asarray(harmonics.lobes_to_sh(jnp.asarray(coefficients), jnp.asarray(axes)))
 
@@ -75,11 +59,11 @@ def test_far_side_of_the_chart_is_large_but_finite():
 def test_chart_gradients(rng, x64):
     frame = Rotation.random(random_state=2).as_matrix()
     check_grads(axis_from_chart, (rng.normal(size=2), frame), order=1, modes=["rev"])
-    check_grads(chart_from_axis, (unit(rng.normal(size=3)), frame), order=1, modes=["rev"])
+    check_grads(chart_from_axis, (oracles.unit(rng.normal(size=3)), frame), order=1, modes=["rev"])
 
 
 def test_reference_frames_are_rotations_about_their_axis(rng, dtype):
-    axes = np.concatenate([np.eye(3), -np.eye(3), unit(rng.normal(size=(20, 3)))])
+    axes = np.concatenate([np.eye(3), -np.eye(3), oracles.unit(rng.normal(size=(20, 3)))])
     frames = np.asarray(zh_fit.reference_frames(jnp.asarray(axes, dtype)), np.float64)
     assert_close(frames[..., 2], axes, ulps=1, dtype=dtype)
     assert_close(frames.swapaxes(1, 2) @ frames, np.broadcast_to(np.eye(3), frames.shape), ulps=16, dtype=dtype)
@@ -101,14 +85,14 @@ def shortest(v, axes):
 def spread_axes(rng, num_lobes):
     """Axes at least 40 degrees from each other and from each other's opposites."""
     while True:
-        axes = unit(rng.normal(size=(num_lobes, 3)))
+        axes = oracles.unit(rng.normal(size=(num_lobes, 3)))
         if (np.abs(np.triu(axes @ axes.T, 1)) < np.cos(0.7)).all():
             return axes
 
 
 def test_one_lobe_is_the_closed_form(rng, dtype):
     """z_l = √(4π/(2l+1)) Σ_m y_lm(d) v_lm and residual |v|² - |z|²."""
-    v, axis = rng.normal(size=16), unit(rng.normal(size=3))
+    v, axis = rng.normal(size=16), oracles.unit(rng.normal(size=3))
     z, residual = solve(jnp.asarray(v, dtype), jnp.asarray(axis[None], dtype))
     y = oracles.real_harmonics(axis, ORDER)
     expected = [np.sqrt(4 * np.pi / (2 * l + 1)) * y[l * l : (l + 1) ** 2] @ v[l * l : (l + 1) ** 2] for l in range(4)]
@@ -166,8 +150,8 @@ def test_coincident_and_antipodal_lobes_share(rng, dtype):
 
 def test_nearly_coincident_lobes_do_not_blow_up(rng):
     """Axes 1e-3 apart could fit a derivative: damping by δ = √eps/4 bounds |z| by 0.9 |v| / √δ, about 100 |v|."""
-    axis = unit(rng.normal(size=3))
-    axes, v = np.stack([axis, unit(axis + 1e-3 * rng.normal(size=3))]), rng.normal(size=(50, 16))
+    axis = oracles.unit(rng.normal(size=3))
+    axes, v = np.stack([axis, oracles.unit(axis + 1e-3 * rng.normal(size=3))]), rng.normal(size=(50, 16))
     z, _ = solve(jnp.asarray(v, jnp.float32), jnp.asarray(axes[None], jnp.float32))
     damping = 0.25 * np.sqrt(np.finfo(np.float32).eps)
     assert np.abs(z).max() < np.linalg.norm(v, axis=1).max() / np.sqrt(damping)
@@ -255,21 +239,6 @@ def test_spread_starts_are_several_and_point_up(rng):
 # --- Searches
 
 
-def visibilities(rng, n):
-    """SH of hemispheres with one to four round occluders."""
-    directions, weights = oracles.sphere_rule(60)
-    y = oracles.real_harmonics(directions, ORDER)
-    vectors = []
-    for _ in range(n):
-        seen = (directions[:, 2] > 0).astype(float)
-        for _ in range(rng.integers(1, 5)):
-            axis = rng.normal(size=3)
-            axis *= np.sign(axis[2]) / np.linalg.norm(axis)
-            seen *= directions @ axis < np.cos(rng.uniform(0.2, 0.8))
-        vectors.append((weights * seen) @ y)
-    return np.stack(vectors)
-
-
 @functools.cache
 def free_fit(num_lobes):
     return quickly(lambda v: harmonics.fit_zh_lobes(v, num_lobes=num_lobes, order=ORDER))
@@ -285,7 +254,7 @@ def fitted(num_lobes):
     axes = np.stack([spread_axes(rng, num_lobes) for _ in range(NUM_KNOWN)])
     axes *= np.where(axes[..., 2:] < 0, -1, 1)
     known = lobes(rng.normal(size=(NUM_KNOWN, num_lobes, ORDER)), axes)
-    v = np.concatenate([visibilities(rng, NUM_RANDOM), known])
+    v = np.concatenate([oracles.visibilities(rng, NUM_RANDOM), known])
     fit = free_fit(num_lobes)(jnp.asarray(v, jnp.float32))
     return v, axes, jax.tree.map(lambda x: np.asarray(x, np.float64), fit)
 
@@ -340,14 +309,14 @@ def anchored_fit(anchor):
     return quickly(lambda v, a: harmonics.fit_zh_lobes(v, num_lobes=2, order=ORDER, anchor_axes=a, anchor=anchor))
 
 
-ANCHORS = unit(np.array([[[0.0, 0.3, 1.0], [0.7, -0.2, 0.6]]])).astype(np.float32)
+ANCHORS = oracles.unit(np.array([[[0.0, 0.3, 1.0], [0.7, -0.2, 0.6]]])).astype(np.float32)
 NUM_FRAMES = 41
 
 
 def moving_occluder(low=-1.0, high=1.0):
     """A disc that crosses the sky from one angle to another, in closed form: hemisphere minus disc."""
     angle = np.linspace(low, high, NUM_FRAMES)
-    d = unit(np.stack([np.sin(angle), 0.2 * np.ones(NUM_FRAMES), np.cos(angle)], axis=-1))
+    d = oracles.unit(np.stack([np.sin(angle), 0.2 * np.ones(NUM_FRAMES), np.cos(angle)], axis=-1))
     sky = harmonics.zh_to_sh(harmonics.hemisphere_zh(order=ORDER), jnp.asarray([0.0, 0.0, 1.0]))
     radius, white = jnp.full(NUM_FRAMES, 0.5), jnp.ones((NUM_FRAMES, 1))
     disc = harmonics.sh_area_light(jnp.asarray(d, jnp.float32), radius, white, order=ORDER)
@@ -406,7 +375,7 @@ def test_anchored_fit_is_a_minimum_of_its_objective(rng):
         for _ in range(6):
             z = fit.coefficients + 1e-2 * rng.normal(size=fit.coefficients.shape)
             assert (penalised(v, anchors, fit.axes, z, 0.1) > here - 1e-7).all()
-            axes = unit(fit.axes + 2e-2 * rng.normal(size=fit.axes.shape))
+            axes = oracles.unit(fit.axes + 2e-2 * rng.normal(size=fit.axes.shape))
             # Twelve steps in float32 may stop short of the minimum by 1e-3 of the objective.
             assert (penalised(v, anchors, axes, fit.coefficients, 0.1) > here * (1 - 1e-3)).all()
 
@@ -423,7 +392,7 @@ def test_strong_anchors_hold_and_weak_ones_let_go():
 
 def test_shared_axis_is_the_best_of_the_sphere(rng):
     """One lobe for many vectors maximises Σ_f Σ_l z_l² over its axis, here over 20,000 directions."""
-    v = visibilities(rng, 24).reshape(2, 12, 16)
+    v = oracles.visibilities(rng, 24).reshape(2, 12, 16)
     shared = quickly(lambda v: harmonics.fit_shared_axes(v, num_lobes=1, order=ORDER))
     axes = shared(jnp.asarray(v, jnp.float32))
     assert axes.shape == (2, 1, 3)

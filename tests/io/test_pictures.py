@@ -4,21 +4,22 @@ import numpy as np
 import PIL.Image
 import pytest
 
+from jaxrender import srgb
 from jaxrender.checks import InputError
 from jaxrender.io import picture
 
 
 def test_srgb_known_values_and_inverse():
     # IEC 61966-2-1: the linear piece ends at 0.0031308 (0.04045 encoded); mid gray 0.5 is 0.21404 linear.
-    np.testing.assert_allclose(picture.decode_srgb(np.array([0.04045, 0.5, 1.0])), [0.0031308, 0.21404, 1.0], rtol=1e-4)
+    np.testing.assert_allclose(srgb.decode_srgb(np.array([0.04045, 0.5, 1.0])), [0.0031308, 0.21404, 1.0], rtol=1e-4)
     x = np.linspace(0.0, 1.0, 1001)
     # The two pieces of the standard meet only to 6 digits, so the inverse is off by that at the joint.
-    np.testing.assert_allclose(picture.decode_srgb(picture.encode_srgb(x)), x, atol=1e-6)
+    np.testing.assert_allclose(srgb.decode_srgb(srgb.encode_srgb(x)), x, atol=1e-6)
 
 
 def test_bytes_survive_a_round_trip():
     values = np.arange(256, dtype=np.uint8).reshape(16, 16, 1)
-    np.testing.assert_array_equal(picture.to_bytes(picture.decode_srgb(values / 255.0)), values)
+    np.testing.assert_array_equal(picture.to_bytes(srgb.decode_srgb(values / 255.0)), values)
     assert picture.to_bytes(values) is values
 
 
@@ -69,7 +70,7 @@ def test_png_modes(tmp_path, rng):
     gray = rng.integers(0, 2**16, size=(4, 6), dtype=np.uint16)
     PIL.Image.fromarray(gray).save(tmp_path / "deep.png")
     np.testing.assert_allclose(
-        picture.read_png(tmp_path / "deep.png")[..., 1], picture.decode_srgb(gray / 65535.0), atol=1e-6
+        picture.read_png(tmp_path / "deep.png")[..., 1], srgb.decode_srgb(gray / 65535.0), atol=1e-6
     )
     rgba = rng.integers(0, 256, size=(4, 6, 4), dtype=np.uint8)
     picture.write_png(tmp_path / "rgba.png", rgba)

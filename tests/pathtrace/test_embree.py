@@ -6,10 +6,7 @@ import trimesh
 
 from jaxrender.pathtrace import embree
 from jaxrender.pathtrace.embree import EmbreeScene
-
-
-def unit(v):
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+from tests.support import oracles
 
 
 def brute_force(vertices, faces, origins, directions):
@@ -33,7 +30,7 @@ def soup(rng):
     vertices = corners.reshape(-1, 3).astype(np.float32)
     faces = np.arange(180, dtype=np.int32).reshape(-1, 3)
     origins = rng.uniform(-3, 3, (500, 3)).astype(np.float32)
-    directions = unit(rng.uniform(-2, 2, (500, 3)) - origins).astype(np.float32)
+    directions = oracles.unit(rng.uniform(-2, 2, (500, 3)) - origins).astype(np.float32)
     return vertices, faces, origins, directions
 
 
@@ -95,7 +92,7 @@ def test_rays_at_edges_and_corners_do_not_slip_through(rng):
     chosen, share = edges[rng.integers(0, len(edges), 20_000)], rng.uniform(0, 1, (20_000, 1))
     targets = np.concatenate([vertices, share * vertices[chosen[:, 0]] + (1 - share) * vertices[chosen[:, 1]]])
     inside = np.broadcast_to([0.13, -0.21, 0.07], targets.shape)
-    origins, directions = (np.ascontiguousarray(x, np.float32) for x in (inside, unit(targets - inside)))
+    origins, directions = (np.ascontiguousarray(x, np.float32) for x in (inside, oracles.unit(targets - inside)))
     hits = EmbreeScene(vertices, np.asarray(sphere.faces)).closest_hit(origins, directions)
     assert (hits.triangle < 0).sum() == 0
     distance = np.linalg.norm(targets - inside, axis=-1)

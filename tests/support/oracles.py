@@ -165,3 +165,26 @@ def phong_closed_forms(alpha: float) -> dict[str, float]:
         "AA": 105 / (2 * a3 * a5 * a7),
         "99": 105 / (2 * a1 * a3 * a5 * a7),
     }
+
+
+# --- Random input
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    """Vectors along the last axis, of length 1."""
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def visibilities(rng: np.random.Generator, n: int) -> np.ndarray:
+    """SH of order 4 of n hemispheres with one to four round occluders."""
+    directions, weights = sphere_rule(60)
+    y = real_harmonics(directions, 4)
+    vectors = []
+    for _ in range(n):
+        seen = (directions[:, 2] > 0).astype(float)
+        for _ in range(rng.integers(1, 5)):
+            axis = rng.normal(size=3)
+            axis *= np.sign(axis[2]) / np.linalg.norm(axis)
+            seen *= directions @ axis < np.cos(rng.uniform(0.2, 0.8))
+        vectors.append((weights * seen) @ y)
+    return np.stack(vectors)

@@ -13,21 +13,6 @@ from torchref.harmonics import zh_fit as twin
 ORDER, NUM_LOBES = 4, 2
 
 
-def visibilities(rng: np.random.Generator, n: int) -> np.ndarray:
-    """SH of hemispheres with one to four round occluders."""
-    directions, weights = oracles.sphere_rule(60)
-    y = oracles.real_harmonics(directions, ORDER)
-    vectors = []
-    for _ in range(n):
-        seen = (directions[:, 2] > 0).astype(float)
-        for _ in range(rng.integers(1, 5)):
-            axis = rng.normal(size=3)
-            axis *= np.sign(axis[2]) / np.linalg.norm(axis)
-            seen *= directions @ axis < np.cos(rng.uniform(0.2, 0.8))
-        vectors.append((weights * seen) @ y)
-    return np.stack(vectors)
-
-
 def compiled(function, *arrays):
     """Runs it with little optimisation: compiling is nearly all of the time."""
     return jax.jit(function, compiler_options={"xla_backend_optimization_level": 0})(*arrays)
@@ -35,7 +20,7 @@ def compiled(function, *arrays):
 
 @pytest.mark.slow
 def test_free_fit_is_as_good_as_brute_force(rng):
-    v = visibilities(rng, 12)
+    v = oracles.visibilities(rng, 12)
     best = twin.fit_zh_lobes(
         torch.tensor(v), num_lobes=NUM_LOBES, order=ORDER, num_starts=12, num_steps=60
     ).residual.numpy()
@@ -51,7 +36,7 @@ def test_free_fit_is_as_good_as_brute_force(rng):
 @pytest.mark.slow
 def test_anchored_fit_ends_at_the_same_axes(rng):
     """Anchored near a good fit, as the next frame of a motion is, both reach the same minimum."""
-    v = visibilities(rng, 8)
+    v = oracles.visibilities(rng, 8)
     free = twin.fit_zh_lobes(torch.tensor(v), num_lobes=NUM_LOBES, order=ORDER).axes.numpy()
     anchors = free + 0.1 * rng.normal(size=free.shape)
     anchors /= np.linalg.norm(anchors, axis=-1, keepdims=True)
@@ -73,7 +58,7 @@ def test_anchored_fit_ends_at_the_same_axes(rng):
 
 @pytest.mark.slow
 def test_shared_axes_are_as_good_as_brute_force(rng):
-    v = visibilities(rng, 10).reshape(2, 5, ORDER**2)
+    v = oracles.visibilities(rng, 10).reshape(2, 5, ORDER**2)
     brute = twin.fit_shared_axes(torch.tensor(v), num_lobes=NUM_LOBES, order=ORDER, num_starts=12, num_steps=60)
     ours = compiled(lambda x: zh_fit.fit_shared_axes(x, num_lobes=NUM_LOBES, order=ORDER), jnp.asarray(v, jnp.float32))
     errors = [
