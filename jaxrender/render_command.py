@@ -40,8 +40,6 @@ def run_render(options: "Render") -> None:
         textures=scene_textures(scene),
     )  # fmt: skip
     seconds = time.perf_counter() - started
-    if rendering.num_unresolved:
-        console.announce(f"{rendering.num_unresolved} samples lie behind more masked layers than are looked through")
     paths = [out]
     write_png(out, tone_map(rendering.image, exposure_stops=options.exposure_stops))
     if options.exr:

@@ -12,7 +12,7 @@ import pytest
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PACKAGES = ("jaxrender", "torchref", "fitting", "benchmarks")
 
-GROUND = {"scene", "camera", "vecmath", "warp", "brdf", "metrics", "checks", "machine", "srgb"}
+GROUND = {"scene", "camera", "vecmath", "warp", "brdf", "metrics", "checks", "machine", "srgb", "sh_basis"}
 COMMANDS = {"cli", "console", "doctor", "render_command"}
 
 #: Part of jaxrender -> the other parts it may import. Data runs from the first line to the last.

@@ -13,7 +13,13 @@ from jaxrender.deferred.interpolate import interpolate_at_offset as interpolate_
 from jaxrender.deferred.interpolate import interpolate_at_sample as interpolate_at_sample
 from jaxrender.deferred.interpolate import sample_places as sample_places
 from jaxrender.deferred.interpolate import weights_at as weights_at
+from jaxrender.deferred.late import FragmentList as FragmentList
+from jaxrender.deferred.late import alpha_to_coverage as alpha_to_coverage
+from jaxrender.deferred.late import draw_late as draw_late
+from jaxrender.deferred.late import resolve as resolve
 from jaxrender.deferred.pipeline import Rendering as Rendering
+from jaxrender.deferred.pipeline import clip_positions as clip_positions
+from jaxrender.deferred.pipeline import draw_gbuffer as draw_gbuffer
 from jaxrender.deferred.pipeline import render_scene as render_scene
 from jaxrender.deferred.pipeline import scene_textures as scene_textures
 from jaxrender.deferred.pipeline import see as see
@@ -25,7 +31,9 @@ from jaxrender.deferred.raster import Budget as Budget
 from jaxrender.deferred.raster import Demand as Demand
 from jaxrender.deferred.raster import Fragments as Fragments
 from jaxrender.deferred.raster import rasterize as rasterize
+from jaxrender.deferred.raster import rasterize_triangles as rasterize_triangles
 from jaxrender.deferred.raster import rasterize_within as rasterize_within
+from jaxrender.deferred.raster import screen_triangles as screen_triangles
 from jaxrender.deferred.samples import CENTER as CENTER
 from jaxrender.deferred.samples import Samples as Samples
 from jaxrender.deferred.samples import ordered_grid as ordered_grid

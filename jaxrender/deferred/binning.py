@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from jaxrender.checks import check_at_least
+from jaxrender.deferred.clipping import GUARD_PX
 from jaxrender.deferred.samples import Samples
 from jaxrender.deferred.triangles import SUBPIXELS, ScreenTriangles
 
@@ -44,6 +46,19 @@ class TileGrid:
         return x * SUBPIXELS - self.width * SUBPIXELS // 2, y * SUBPIXELS - self.height * SUBPIXELS // 2
 
 
+def tile_grid(height: int, width: int, samples: Samples) -> tuple[TileGrid, Samples]:
+    """Tiles over the sample cells of an image, and the pattern in a cell: an ordered grid is a larger image.
+
+    A tile has 256 lanes, or a little more or less.
+    """
+    check_at_least("height", height, 0)
+    check_at_least("width", width, 0)
+    h, w, count = height * samples.grid, width * samples.grid, len(samples.offsets)
+    if max(h, w) > 2 * (GUARD_PX - 1):
+        raise ValueError(f"height, width: expected at most {2 * (GUARD_PX - 1)} samples a side, got {h} x {w}")
+    return TileGrid(h, w, 16 if count == 1 else 8 if count <= 4 else 4), Samples(offsets=samples.offsets)
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Spans:
@@ -57,9 +72,8 @@ class Spans:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TileLists:
-    """Triangles by tile: those of tile i are triangles[start[i] : start[i] + count[i]]."""
+    """Where the pairs of each tile are, among pairs sorted by tile: from start[i] on, count[i] of them."""
 
-    triangles: Int[Array, " p"]
     start: Int[Array, " tiles"]
     count: Int[Array, " tiles"]
 
@@ -132,15 +146,16 @@ def pairs(runs: Spans, *, max_pairs: int, num_tiles: int) -> tuple[Int[Array, " 
     return tile, runs.triangle[run]
 
 
-def sort_pairs(tile: Int[Array, " p"], triangle: Int[Array, " p"], *, num_tiles: int) -> TileLists:
-    """Groups the pairs by tile; within a tile the triangles keep their order."""
-    return tile_lists(tile, triangle[jnp.argsort(tile, stable=True)], num_tiles=num_tiles)
+def sort_pairs(tile: Int[Array, " p"], triangle: Int[Array, " p"]) -> tuple[Int[Array, " p"], Int[Array, " p"]]:
+    """The pairs by tile; within a tile the triangles keep their order."""
+    order = jnp.argsort(tile, stable=True)
+    return tile[order], triangle[order]
 
 
-def tile_lists(tile: Int[Array, " p"], sorted_triangles: Int[Array, " p"], *, num_tiles: int) -> TileLists:
-    """Lists from pairs whose triangles are already sorted by tile (and whose tiles need not be)."""
+def tile_lists(tile: Int[Array, " p"], *, num_tiles: int) -> TileLists:
+    """Where each tile's pairs begin once they are sorted; they need not be sorted here."""
     count = jnp.zeros(num_tiles, jnp.int32).at[tile].add(1, mode="drop")
-    return TileLists(triangles=sorted_triangles, start=jnp.cumsum(count) - count, count=count)
+    return TileLists(start=jnp.cumsum(count) - count, count=count)
 
 
 def _expand(counts: Int[Array, " n"], size: int):

@@ -5,20 +5,21 @@ Differentiable in the scene's positions, normals, colors and uv for fixed fragme
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxrender.deferred.interpolate import attribute_gradients, blend, corner_weights
+from jaxrender.checks import check_last_axis
+from jaxrender.deferred.interpolate import sample_places
 from jaxrender.deferred.raster import Fragments
 from jaxrender.deferred.texture import Textures, sample_texture_grad
+from jaxrender.deferred.triangles import SUBPIXELS, ScreenTriangles
 from jaxrender.scene import Scene
-from jaxrender.vecmath import normalize
+from jaxrender.vecmath import normalize, safe_div
 
-#: Rows of the image that are interpolated at a time.
-ROWS_PER_BAND = 8
+#: Samples that are interpolated at a time; what they gather stays in a processor's cache.
+SAMPLES_PER_BAND = 1 << 15
 
 
 @jax.tree_util.register_dataclass
@@ -34,93 +35,201 @@ class GBuffer:
       color: linear RGBA of the vertex colors.
       depth: linear view depth (clip w) of a perspective camera.
       material_id, triangle_id: -1 where empty.
+      motion: where the surface is in this picture, less where it was in the previous one, in pixels, x right and y
+        down. None without a previous pose; 0 where it was behind the eye.
     """
 
-    position: Float[Array, "h w s 3"]
-    normal: Float[Array, "h w s 3"]
-    geometric_normal: Float[Array, "h w s 3"]
-    uv: Float[Array, "h w s 2"]
-    duv_dx: Float[Array, "h w s 2"]
-    duv_dy: Float[Array, "h w s 2"]
-    color: Float[Array, "h w s 4"]
-    depth: Float[Array, "h w s"]
-    material_id: Int[Array, "h w s"]
-    triangle_id: Int[Array, "h w s"]
+    position: Float[Array, "*b 3"]
+    normal: Float[Array, "*b 3"]
+    geometric_normal: Float[Array, "*b 3"]
+    uv: Float[Array, "*b 2"]
+    duv_dx: Float[Array, "*b 2"]
+    duv_dy: Float[Array, "*b 2"]
+    color: Float[Array, "*b 4"]
+    depth: Float[Array, "*b"]
+    material_id: Int[Array, "*b"]
+    triangle_id: Int[Array, "*b"]
+    motion: Float[Array, "*b 2"] | None = None
 
     @property
-    def coverage(self) -> Bool[Array, "h w s"]:
+    def coverage(self) -> Bool[Array, "*b"]:
         return self.triangle_id >= 0
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class AttributeTable:
+    """The attributes of a scene, ready to be gathered by sample: a row for each triangle of the mesh or the screen.
+
+    Attributes:
+      corner: attributes of corner 0 and what has to be added for corners 1 and 2, side by side: position, normal, uv,
+        color, tangent, and previous clip position if there is one.
+      flat: unit geometric normal of the front; material_id: by triangle of the mesh.
+      slopes: by screen triangle, steps of 1/w, b_1/w and b_2/w per pixel to the right, then downwards.
+      front: by screen triangle.
+    """
+
+    corner: Float[Array, "t c"]
+    flat: Float[Array, "t 3"]
+    material_id: Int[Array, " t"]
+    slopes: Float[Array, "n 6"]
+    front: Bool[Array, " n"]
+
+
+def attribute_table(
+    scene: Scene, triangles: ScreenTriangles, *, grid: int = 1, previous_clip: Float[Array, "v 4"] | None = None
+) -> AttributeTable:
+    """Gathers the attributes of all triangles.
+
+    Args:
+      triangles: of the fragments; grid: m of their m x m samples.
+      previous_clip: clip positions of the vertices in the previous picture.
+    """
+    values = [scene.positions, scene.normals, scene.uv, scene.colors, scene.tangents]
+    values += [] if previous_clip is None else [previous_clip]
+    a, b, c = (jnp.concatenate(values, axis=1)[scene.faces[:, k]] for k in range(3))
+    p = scene.positions[scene.faces]
+    return AttributeTable(
+        corner=jnp.concatenate([a, b - a, c - a], axis=1),
+        flat=normalize(jnp.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])),
+        material_id=scene.material_id,
+        slopes=plane_slopes(triangles) * grid,
+        front=triangles.front,
+    )
+
+
+def plane_slopes(triangles: ScreenTriangles) -> Float[Array, "n 6"]:
+    """Steps of 1/w, b_1/w and b_2/w, which are linear on the screen, per pixel to the right, then downwards."""
+    xy, over_w = triangles.xy.astype(jnp.float32), safe_div(jnp.ones_like(triangles.w), triangles.w)
+    planes = [over_w, triangles.weights[..., 1] * over_w, triangles.weights[..., 2] * over_w]
+    scale = SUBPIXELS / triangles.area
+    # Of the weight of corner k: the edge opposite to it, turned by a quarter.
+    right = [-(xy[:, (k + 2) % 3, 1] - xy[:, (k + 1) % 3, 1]) * scale for k in range(3)]
+    down = [(xy[:, (k + 2) % 3, 0] - xy[:, (k + 1) % 3, 0]) * scale for k in range(3)]
+    return jnp.stack([sum(d[k] * p[:, k] for k in range(3)) for d in (right, down) for p in planes], axis=1)
+
+
 def make_gbuffer(
-    scene: Scene, fragments: Fragments, *, textures: Textures | None = None, max_anisotropy: int = 8
+    scene: Scene,
+    fragments: Fragments,
+    *,
+    textures: Textures | None = None,
+    max_anisotropy: int = 8,
+    previous_clip: Float[Array, "v 4"] | None = None,
 ) -> GBuffer:
     """Interpolates the scene's attributes at all samples.
 
     Args:
       textures: of the scene's images; without them there are no normal maps.
       max_anisotropy: taps of a normal map's lookup.
+      previous_clip: clip positions of the vertices in the previous picture, for `GBuffer.motion`.
     """
-    h, band = fragments.triangle_id.shape[0], ROWS_PER_BAND
+    grid = fragments.samples.grid
+    table = attribute_table(scene, fragments.triangles, grid=grid, previous_clip=previous_clip)
+    h, w, s = fragments.triangle_id.shape
+    band = min(max(1, SAMPLES_PER_BAND // max(w * s, 1)), max(h, 1))
+    starts = jnp.arange(-(-h // band), dtype=jnp.int32) * band
+    interpolated = jax.lax.map(
+        lambda start: gbuffer_rows(
+            scene, table, fragments, jnp.minimum(start, h - band), num_rows=band, textures=textures,
+            max_anisotropy=max_anisotropy,
+        ),
+        starts,
+    )  # fmt: skip
+    return jax.tree.map(lambda values: _joined(values, h), interpolated)
 
-    attributes = jnp.concatenate([scene.positions, scene.normals, scene.tangents, scene.uv, scene.colors], axis=-1)
-    corners = scene.positions[scene.faces]
-    flat = normalize(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
-    def some_rows(fields: dict[str, Any]) -> GBuffer:
-        own = dataclasses.replace(fragments, **fields)
-        return _interpolated(scene, own, textures, attributes, flat, max_anisotropy=max_anisotropy)
+def _joined(bands: Array, height: int) -> Array:
+    """Bands of rows one below the other; the last one begins higher up, if it would not fit."""
+    n, band, *rest = bands.shape
+    if n * band == height:
+        return bands.reshape(height, *rest)
+    return jnp.concatenate([bands[:-1].reshape(-1, *rest), bands[-1, n * band - height :]])
 
-    # Band by band: what a band gathers stays in a processor's cache.
+
+def gbuffer_rows(
+    scene: Scene,
+    table: AttributeTable,
+    fragments: Fragments,
+    start: Int[Array, ""] | int,
+    *,
+    num_rows: int,
+    textures: Textures | None = None,
+    max_anisotropy: int = 8,
+) -> GBuffer:
+    """All fields for some rows of an image, from row `start` on.
+
+    Args:
+      table: of `attribute_table`.
+    """
     names = ("triangle_id", "screen_id", "barycentrics", "depth", "w")
-    fields = {name: _in_bands(getattr(fragments, name), band, -1 if name.endswith("_id") else 0) for name in names}
-    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:h], jax.lax.map(some_rows, fields))
+    rows = {name: jax.lax.dynamic_slice_in_dim(getattr(fragments, name), start, num_rows) for name in names}
+    gbuffer, previous = surface_points(
+        scene, table, rows["triangle_id"], rows["screen_id"], rows["barycentrics"], rows["w"], textures=textures,
+        max_anisotropy=max_anisotropy,
+    )  # fmt: skip
+    if not previous.shape[-1]:
+        return gbuffer
+    return dataclasses.replace(gbuffer, motion=_motion(fragments, previous, start))
 
 
-def _in_bands(image: Array, band: int, empty: int) -> Array:
-    """Rows in groups of `band`, filled up with empty ones."""
-    h, *rest = image.shape
-    padding = [(0, -h % band), *((0, 0) for _ in rest)]
-    return jnp.pad(image, padding, constant_values=empty).reshape(-1, band, *rest)
+def surface_points(
+    scene: Scene, table: AttributeTable, triangle_id: Int[Array, "*b"], screen_id: Int[Array, "*b"],
+    barycentrics: Float[Array, "*b 2"], w: Float[Array, "*b"], *, textures: Textures | None = None,
+    max_anisotropy: int = 8,
+) -> tuple[GBuffer, Float[Array, "*b p"]]:  # fmt: skip
+    """Points on triangles, in any order: the fields of `Fragments` or of `late.FragmentList` -> those of `GBuffer`.
 
-
-def _interpolated(
-    scene: Scene, fragments: Fragments, textures: Textures | None, attributes: Float[Array, "v 16"],
-    flat: Float[Array, "t 3"], *, max_anisotropy: int,
-) -> GBuffer:  # fmt: skip
-    """All fields for some rows of an image, from all vertex attributes side by side and the triangles' normals."""
-    weights = corner_weights(fragments)
-    values = blend(fragments, attributes, weights)
-    position, normal, tangent, uv, color = jnp.split(values, [3, 6, 10, 12], axis=-1)
-    duv_dx, duv_dy = attribute_gradients(fragments, scene.uv)
-    covered = fragments.coverage
-    triangle = jnp.maximum(fragments.triangle_id, 0)
-    material_id = jnp.where(covered, scene.material_id[triangle], -1)
+    Returns:
+      the surface there, with any leading axes, and the previous clip position (p = 4, or 0 if the table has none).
+    """
+    b1, b2 = barycentrics[..., :1], barycentrics[..., 1:]
+    some, own, screen = (triangle_id >= 0)[..., None], jnp.maximum(triangle_id, 0), jnp.maximum(screen_id, 0)
+    corner = table.corner[own]
+    c = corner.shape[-1] // 3
+    step_1, step_2 = corner[..., c : 2 * c], corner[..., 2 * c :]
+    values = jnp.where(some, corner[..., :c] + b1 * step_1 + b2 * step_2, 0.0)
+    position, normal, uv, color, tangent, previous = jnp.split(values, [3, 6, 8, 12, 16], axis=-1)
+    # A = a_0 + b_1 (a_1 - a_0) + b_2 (a_2 - a_0), and db_k = w (d(b_k/w) - b_k d(1/w)).
+    slopes = table.slopes[screen]
+    duv_dx, duv_dy = (
+        jnp.where(some, w[..., None] * ((d[..., 1:2] - b1 * d[..., :1]) * step_1[..., 6:8]
+                                        + (d[..., 2:] - b2 * d[..., :1]) * step_2[..., 6:8]), 0.0)
+        for d in (slopes[..., :3], slopes[..., 3:])
+    )  # fmt: skip
+    material_id = jnp.where(some[..., 0], table.material_id[own], -1)
     # The back of a surface is seen only where it has two sides; there its normals are turned over.
-    side = jnp.where(fragments.triangles.front[jnp.maximum(fragments.screen_id, 0)], 1.0, -1.0)[..., None]
+    side = jnp.where(some, jnp.where(table.front[screen], 1.0, -1.0)[..., None], 0.0)
     normal = normalize(normal)
     if textures is not None:
         lookup = uv, duv_dx, duv_dy, max_anisotropy
         normal = _with_normal_map(scene, textures, normal, tangent, jnp.maximum(material_id, 0), lookup)
-    some = covered[..., None]
-    return GBuffer(
-        position=position,
-        normal=jnp.where(some, normal * side, 0.0),
-        geometric_normal=jnp.where(some, flat[triangle] * side, 0.0),
-        uv=uv,
-        duv_dx=duv_dx,
-        duv_dy=duv_dy,
-        color=color,
-        depth=fragments.w,
-        material_id=material_id,
-        triangle_id=fragments.triangle_id,
+    gbuffer = GBuffer(
+        position=position, normal=normal * side, geometric_normal=table.flat[own] * side, uv=uv, duv_dx=duv_dx,
+        duv_dy=duv_dy, color=color, depth=w, material_id=material_id, triangle_id=triangle_id,
+    )  # fmt: skip
+    return gbuffer, previous
+
+
+def _motion(fragments: Fragments, previous: Float[Array, "r w s 4"], start: Int[Array, ""] | int):
+    """From interpolated previous clip positions: this place less that place, in pixels."""
+    h, w, _ = fragments.triangle_id.shape
+    check_last_axis("previous_clip", previous, 4)
+    unit = SUBPIXELS * fragments.samples.grid
+    x, y = (
+        jax.lax.dynamic_slice_in_dim(at, start, len(previous)).astype(previous.dtype) / unit
+        for at in sample_places(fragments)
     )
+    seen = previous[..., 3] > 0.0
+    over_w = 1.0 / jnp.where(seen, previous[..., 3], 1.0)
+    moved = jnp.stack([x - 0.5 * w * previous[..., 0] * over_w, y + 0.5 * h * previous[..., 1] * over_w], axis=-1)
+    return jnp.where(seen[..., None], moved, 0.0)
 
 
 def _with_normal_map(
-    scene: Scene, textures: Textures, normal: Float[Array, "h w s 3"], tangent: Float[Array, "h w s 4"],
-    material: Int[Array, "h w s"], lookup: tuple,
-) -> Float[Array, "h w s 3"]:  # fmt: skip
+    scene: Scene, textures: Textures, normal: Float[Array, "*b 3"], tangent: Float[Array, "*b 4"],
+    material: Int[Array, "*b"], lookup: tuple,
+) -> Float[Array, "*b 3"]:  # fmt: skip
     """The shading normal turned by the material's normal map, where it has one."""
     uv, duv_dx, duv_dy, max_anisotropy = lookup
     layer = scene.material.normal_texture[material]

@@ -2,24 +2,32 @@
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxrender.camera import Camera, clip_from_world, depth_range
-from jaxrender.deferred.gbuffer import GBuffer, make_gbuffer
-from jaxrender.deferred.raster import Fragments, rasterize
+from jaxrender.checks import check_one_of
+from jaxrender.deferred.bands import band_starts, in_bands
+from jaxrender.deferred.gbuffer import (
+    SAMPLES_PER_BAND,
+    AttributeTable,
+    GBuffer,
+    attribute_table,
+    gbuffer_rows,
+    surface_points,
+)
+from jaxrender.deferred.late import FragmentList, alpha_to_coverage, draw_late
+from jaxrender.deferred.raster import Fragments, rasterize_triangles, screen_triangles
 from jaxrender.deferred.samples import CENTER, Samples
-from jaxrender.deferred.shade import Surface, look_up_surface, shade
+from jaxrender.deferred.shade import TEXTURE_SLOTS, Surface, look_up_surface, shade
 from jaxrender.deferred.texture import Textures, build_textures
-from jaxrender.scene import DIRECTIONAL, MASK, Lights, Scene, scene_bounds
-from jaxrender.vecmath import normalize
+from jaxrender.scene import DIRECTIONAL, MASK, OPAQUE, Lights, Scene, scene_bounds
+from jaxrender.vecmath import matmul, normalize
 
-#: Layers of masked surfaces behind each other that are looked through before the rest counts as opaque.
-MAX_LAYERS = 64
+TRANSPARENCY = ("test", "coverage", "none")
 
 
 def scene_textures(scene: Scene) -> Textures | None:
@@ -48,6 +56,13 @@ def default_lights() -> tuple[Lights, Float[Array, "3 9"]]:
     return lights, zero.at[:, 0].set(3.5449 * 0.6 * constant).at[:, 1].set(-2.0467 * up)
 
 
+def clip_positions(scene: Scene, camera: Camera, *, height: int, width: int) -> Float[Array, "v 4"]:
+    """The scene's vertices in the camera's clip space, with the tightest depth range that holds them."""
+    near, far = depth_range(camera, *scene_bounds(scene))
+    matrix = clip_from_world(camera, height=height, width=width, near=near, far=far)
+    return matmul(jnp.pad(scene.positions, ((0, 0), (0, 1)), constant_values=1.0), matrix.T)
+
+
 def see(
     scene: Scene,
     camera: Camera,
@@ -56,62 +71,74 @@ def see(
     width: int,
     samples: Samples = CENTER,
     textures: Textures | None = None,
-    max_layers: int = MAX_LAYERS,
-) -> tuple[Fragments, int]:
+    transparency: str = "test",
+) -> Fragments:
     """What each sample sees: back faces culled unless a material has two sides, masked texels looked through.
 
-    Returns:
-      fragments, and the number of samples still on a discarded texel after `max_layers` layers (they keep what is
-      behind all of them).
+    Not for use inside `jit`.
+
+    Args:
+      transparency: "test" discards masked texels below their cutoff, as glTF rules, and draws blended materials as
+        opaque; "coverage" turns the alpha of both into a share of the samples (`late.alpha_to_coverage`), which wants
+        several of them; "none" takes everything as opaque.
     """
-    near, far = depth_range(camera, *scene_bounds(scene))
-    matrix = clip_from_world(camera, height=height, width=width, near=near, far=far)
-    points = jnp.concatenate([scene.positions, jnp.ones_like(scene.positions[:, :1])], axis=1)
-    clip = jnp.einsum("vi,ji->vj", points, matrix, precision="highest")
-    masked = scene.material.alpha_mode[scene.material_id] == MASK
+    check_one_of("transparency", transparency, TRANSPARENCY)
+    clip = clip_positions(scene, camera, height=height, width=width)
     two_sided = scene.material.double_sided[scene.material_id]
-    draw = functools.partial(
-        rasterize, clip, scene.faces, height=height, width=width, samples=samples, cull="back", two_sided=two_sided
+    triangles = screen_triangles(
+        clip, scene.faces, height=height, width=width, samples=samples, cull="back", two_sided=two_sided
     )
-    if not bool(masked.any()):
-        return draw(), 0
-    found = draw(drawn=~masked)
-    beyond, left = jnp.zeros_like(found.depth) - 1.0, 0
-    for _ in range(max_layers):
-        layer = draw(drawn=masked, beyond=beyond)
-        found, beyond, left = _look_through(scene, textures, found, layer)
-        if int(left) == 0:
-            break
-    return found, int(left)
+    draw = functools.partial(rasterize_triangles, faces=scene.faces, height=height, width=width, samples=samples)
+    mode = scene.material.alpha_mode[scene.material_id]
+    clear = {"test": mode == MASK, "coverage": mode != OPAQUE, "none": mode < OPAQUE}[transparency]
+    if not bool(clear.any()):
+        return draw(triangles)
+    early, late = _split(triangles, clear)
+    table = _table(scene, triangles, None, grid=samples.grid)
+    keep = functools.partial(
+        _keep, scene, table, textures, num_samples=samples.count, width=width, coverage=transparency == "coverage",
+    )  # fmt: skip
+    return dataclasses.replace(draw_late(draw(early), late, keep), triangles=triangles)
 
 
 @jax.jit
-def _look_through(scene: Scene, textures: Textures | None, found: Fragments, layer: Fragments):
-    """Puts the opaque texels of a layer of masked triangles in front of what was found; says where to look on."""
-    gbuffer = make_gbuffer(scene, layer)
-    alpha = look_up_surface(gbuffer, scene.material, textures, max_anisotropy=1).alpha
-    cutoff = scene.material.alpha_cutoff[jnp.maximum(gbuffer.material_id, 0)]
-    nearer = layer.coverage & (layer.depth < found.depth)
-    kept, discarded = nearer & (alpha >= cutoff), nearer & (alpha < cutoff)
-    names = ("triangle_id", "screen_id", "barycentrics", "depth", "w")
-    merged: dict[str, Any] = {
-        name: jnp.where(kept.reshape(*kept.shape, *(1,) * (getattr(found, name).ndim - 3)), getattr(layer, name),
-                        getattr(found, name))
-        for name in names
-    }  # fmt: skip
-    # The triangles of both differ only in which of them were drawn.
-    return dataclasses.replace(found, **merged), jnp.where(discarded, layer.depth, 2.0), jnp.sum(discarded)
+def _split(triangles, clear: Bool[Array, " t"]):
+    """The triangles that are drawn early, and those that are drawn late."""
+    late = clear[triangles.source]
+    return tuple(dataclasses.replace(triangles, valid=triangles.valid & own) for own in (~late, late))
+
+
+_table = jax.jit(
+    lambda scene, triangles, previous_clip, grid: attribute_table(
+        scene, triangles, grid=grid, previous_clip=previous_clip
+    ),
+    static_argnames="grid",
+)
+
+
+@functools.partial(jax.jit, static_argnames=("num_samples", "width", "coverage"))
+def _keep(
+    scene: Scene, table: AttributeTable, textures: Textures | None, late: FragmentList, *, num_samples: int,
+    width: int, coverage: bool,
+) -> tuple[Bool[Array, " n"], Float[Array, " n"]]:  # fmt: skip
+    """The shader of masked materials; textures are looked up trilinearly."""
+    gbuffer, _ = surface_points(scene, table, late.triangle_id, late.screen_id, late.barycentrics, late.w)
+    surface = look_up_surface(gbuffer, scene.material, textures, max_anisotropy=1, slots=("base_color_texture",))
+    if coverage:
+        return alpha_to_coverage(surface.alpha, late.place, num_samples=num_samples, width=width), late.depth
+    material = jnp.maximum(gbuffer.material_id, 0)
+    discards = scene.material.alpha_mode[material] == MASK
+    return ~discards | (surface.alpha >= scene.material.alpha_cutoff[material]), late.depth
 
 
 @dataclasses.dataclass(frozen=True)
 class Rendering:
-    """An image (linear RGB, straight alpha = share of covered samples), and what it was made of."""
+    """An image (linear RGB, not multiplied by alpha = share of covered samples), and what it was made of."""
 
     image: Float[np.ndarray, "h w 3"]
     alpha: Float[np.ndarray, "h w"]
     gbuffer: GBuffer
     surface: Surface
-    num_unresolved: int
 
 
 def render_scene(
@@ -123,29 +150,74 @@ def render_scene(
     samples: Samples = CENTER,
     textures: Textures | None = None,
     lights: Lights | None = None,
-    ambient: Float[Array, "3 9"] | None = None,
+    ambient: Float[Array, "3 k"] | None = None,
     max_anisotropy: int = 8,
+    transparency: str = "test",
+    model: str = "metallic_roughness",
+    previous_clip: Float[Array, "v 4"] | None = None,
 ) -> Rendering:
     """Renders a scene with its own lights, or with a sun and a sky if it has none; samples are averaged.
+
+    Not for use inside `jit`; from fragments on, everything it calls is.
 
     Args:
       textures: of `scene_textures`, made here if not given.
       lights, ambient: instead of the scene's.
+      transparency: as in `see`; model: as in `shade`; previous_clip: as in `make_gbuffer`.
     """
     textures = scene_textures(scene) if textures is None else textures
     if lights is None and ambient is None and not len(scene.lights.kind):
         lights, ambient = default_lights()
     lights = scene.lights if lights is None else lights
-    fragments, left = see(scene, camera, height=height, width=width, samples=samples, textures=textures)
-    gbuffer, surface, mean, share = _shaded(scene, fragments, textures, lights, ambient, camera.eye, max_anisotropy)
-    return Rendering(np.asarray(mean), np.asarray(share), gbuffer, surface, left)
+    fragments = see(
+        scene, camera, height=height, width=width, samples=samples, textures=textures, transparency=transparency
+    )
+    table = _table(scene, fragments.triangles, previous_clip, grid=samples.grid)
+    slots = tuple(
+        slot for slot in (*TEXTURE_SLOTS, "normal_texture") if bool((getattr(scene.material, slot) >= 0).any())
+    )
+    band = min(max(1, SAMPLES_PER_BAND // (width * samples.count)), height)
+    rows = functools.partial(
+        _shaded_rows, scene, table, fragments, textures, lights, ambient, camera.eye, num_rows=band,
+        max_anisotropy=max_anisotropy, slots=slots, model=model,
+    )  # fmt: skip
+    gbuffer, surface, mean, share = in_bands(
+        lambda start: rows(np.int32(start)), band_starts(height, band), height=height
+    )
+    return Rendering(np.asarray(mean), np.asarray(share), gbuffer, surface)
 
 
-@functools.partial(jax.jit, static_argnames="max_anisotropy")
-def _shaded(scene, fragments, textures, lights, ambient, eye, max_anisotropy):
-    gbuffer = make_gbuffer(scene, fragments, textures=textures, max_anisotropy=max_anisotropy)
-    surface = look_up_surface(gbuffer, scene.material, textures, max_anisotropy=max_anisotropy)
-    radiance = shade(gbuffer, surface, lights, eye, ambient=ambient)
+@functools.partial(jax.jit, static_argnames=("num_rows", "max_anisotropy", "slots", "model"))
+def _shaded_rows(
+    scene, table, fragments, textures, lights, ambient, eye, start, *, num_rows, max_anisotropy, slots, model
+):
+    gbuffer = gbuffer_rows(
+        scene, table, fragments, start, num_rows=num_rows, max_anisotropy=max_anisotropy,
+        textures=textures if "normal_texture" in slots else None,
+    )  # fmt: skip
+    surface = look_up_surface(gbuffer, scene.material, textures, max_anisotropy=max_anisotropy, slots=slots)
+    radiance = shade(gbuffer, surface, lights, eye, ambient=ambient, model=model)
     share = jnp.mean(gbuffer.coverage.astype(jnp.float32), axis=-1)
     mean = jnp.sum(radiance, axis=-2) / jnp.maximum(share[..., None] * radiance.shape[-2], 1.0)
     return gbuffer, surface, mean, share
+
+
+def draw_gbuffer(
+    scene: Scene,
+    fragments: Fragments,
+    *,
+    textures: Textures | None = None,
+    max_anisotropy: int = 8,
+    previous_clip: Float[Array, "v 4"] | None = None,
+) -> GBuffer:
+    """`make_gbuffer` for large images: on all cores, in bounded memory. Not for use inside `jit`."""
+    height, width, num_samples = fragments.triangle_id.shape
+    table = _table(scene, fragments.triangles, previous_clip, grid=fragments.samples.grid)
+    band = min(max(1, 2 * SAMPLES_PER_BAND // (width * num_samples)), height)
+    rows = functools.partial(
+        _gbuffer_rows, scene, table, fragments, num_rows=band, textures=textures, max_anisotropy=max_anisotropy
+    )
+    return in_bands(lambda start: rows(np.int32(start)), band_starts(height, band), height=height)
+
+
+_gbuffer_rows = jax.jit(gbuffer_rows, static_argnames=("num_rows", "max_anisotropy"))

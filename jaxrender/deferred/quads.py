@@ -19,10 +19,11 @@ from jaxtyping import Array, Float, Int
 
 from jaxrender.checks import check_at_least, check_same_shape
 from jaxrender.deferred.binning import TileGrid, pairs, rows_of_triangles, spans
+from jaxrender.deferred.coverage import Lanes, TriangleRows, cover, set_up_pairs, set_up_triangles
 from jaxrender.deferred.interpolate import blend, sample_places, weights_at
 from jaxrender.deferred.raster import Fragments
 from jaxrender.deferred.samples import Samples
-from jaxrender.deferred.triangles import SUBPIXELS, ScreenTriangles, edges, screen_barycentrics
+from jaxrender.deferred.triangles import SUBPIXELS, ScreenTriangles
 from jaxrender.metrics import heatmap
 
 # --- Derivatives
@@ -150,10 +151,11 @@ def quad_coverage(fragments: Fragments) -> Quads:
     m, pattern = fragments.samples.grid, Samples(offsets=fragments.samples.offsets)
     grid = TileGrid(h * m, w * m, 16 if pattern.count == 1 else 8)
     tile, triangle = _tile_pairs(fragments.triangles, grid, pattern)
+    rows = _triangle_rows(fragments.triangles, grid, pattern)
     half, found = grid.size // 2, []
     for start in range(0, len(tile), _CHUNK):
         t, k = (np.pad(v[start : start + _CHUNK], (0, max(start + _CHUNK - len(v), 0))) for v in (tile, triangle))
-        masks = np.asarray(_quad_masks_jit(fragments.triangles, t, k, grid, pattern))[: len(tile) - start]
+        masks = np.asarray(_quad_masks_jit(fragments.triangles, rows, t, k, grid, pattern))[: len(tile) - start]
         pair, quad = np.nonzero(masks)
         row, column = t[pair] // grid.columns * half + quad // half, t[pair] % grid.columns * half + quad % half
         found.append(np.stack([k[pair], row, column, masks[pair, quad]]).astype(np.int32))
@@ -180,14 +182,17 @@ def _power_of_two(count: int) -> int:
 
 
 def _quad_masks(
-    triangles: ScreenTriangles, tile: Int[Array, " p"], triangle: Int[Array, " p"], grid: TileGrid, pattern: Samples
-) -> Int[Array, "p q"]:
+    triangles: ScreenTriangles, rows: TriangleRows, tile: Int[Array, " p"], triangle: Int[Array, " p"],
+    grid: TileGrid, pattern: Samples,
+) -> Int[Array, "p q"]:  # fmt: skip
     """Masks (as in `Quads`) of the quads of a tile, row by row, for p pairs of a tile and a triangle.
 
     Pixels outside the image are not covered.
     """
     half = grid.size // 2
-    inside = _inside(triangles, triangle, *grid.corner(tile), grid.size, pattern)
+    lanes = Lanes.of(grid.size, pattern)
+    pairs = set_up_pairs(triangles, tile, triangle, grid, lanes)
+    inside, _ = cover(pairs, rows, jnp.arange(len(tile), dtype=jnp.int32), lanes)
     pixels = inside.reshape(-1, grid.size, grid.size, len(pattern.offsets)).any(axis=-1)
     steps = jnp.arange(grid.size, dtype=jnp.int32)[None]
     in_rows = (tile // grid.columns * grid.size)[:, None] + steps < grid.height
@@ -198,32 +203,13 @@ def _quad_masks(
     return jnp.sum(quads * lane_bits, axis=(2, 4)).reshape(-1, half * half)
 
 
-def _inside(triangles: ScreenTriangles, triangle: Int[Array, " p"], x, y, size: int, pattern: Samples):
-    """Which samples of `size` x `size` pixels lie in the triangle and between the near and far plane; (p, lanes).
-
-    The sums stay within int32, as `edges` wants: 16 steps of a pixel, or 128 of a sixteenth.
-    """
-    unit = SUBPIXELS if pattern.count == 1 else SUBPIXELS // 16
-    row, column, offset = np.meshgrid(np.arange(size), np.arange(size), np.array(pattern.offsets)[:, 0], indexing="ij")
-    right = (column * SUBPIXELS + SUBPIXELS // 2 + offset * (SUBPIXELS // 16)).reshape(1, -1).astype(np.int32)
-    offset = np.broadcast_to(np.array(pattern.offsets)[:, 1], row.shape)
-    down = (row * SUBPIXELS + SUBPIXELS // 2 + offset * (SUBPIXELS // 16)).reshape(1, -1).astype(np.int32)
-    base = SUBPIXELS // 2 if unit == SUBPIXELS else 0
-    xy, z, area = triangles.xy[triangle], triangles.z[triangle], triangles.area[triangle]
-    c, dx, dy, *_ = edges(xy, x + base, y + base, unit=unit)
-    steps_x, steps_y = (right - base) // unit, (down - base) // unit
-    e = [c[:, k, None] + dx[:, k, None] * steps_y - dy[:, k, None] * steps_x for k in range(3)]
-    here = jnp.sum(screen_barycentrics(xy, area, x, y) * z, axis=1)
-    # Corner k lies opposite to edge k+1.
-    slope_x, slope_y = (jnp.sum(jnp.roll(d.astype(z.dtype), -1, axis=1) * z, axis=1) / area for d in (-dy, dx))
-    depth = here[:, None] + slope_x[:, None] * right.astype(z.dtype) + slope_y[:, None] * down.astype(z.dtype)
-    depth = jnp.clip(depth, z.min(axis=1)[:, None], z.max(axis=1)[:, None])
-    return ((e[0] | e[1] | e[2]) >= 0) & (depth >= 0.0) & (depth <= 1.0)
-
-
 _rows = jax.jit(rows_of_triangles, static_argnames=("grid", "samples"))
 _spans = jax.jit(spans, static_argnames=("grid", "samples", "max_spans"))
 _pairs = jax.jit(pairs, static_argnames=("max_pairs", "num_tiles"))
+_triangle_rows = jax.jit(
+    lambda triangles, grid, pattern: set_up_triangles(triangles, Lanes.of(grid.size, pattern)),
+    static_argnames=("grid", "pattern"),
+)
 _quad_masks_jit = jax.jit(_quad_masks, static_argnames=("grid", "pattern"))
 
 

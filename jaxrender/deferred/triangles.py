@@ -89,29 +89,32 @@ def project_triangles(
     )  # fmt: skip
 
 
-def edges(
-    xy: Int[Array, "*b 3 2"], px: Int[Array, "*b"], py: Int[Array, "*b"], *, unit: int
-) -> tuple[Int[Array, "*b 3"], Int[Array, "*b 3"], Int[Array, "*b 3"], Float[Array, "*b 3"]]:
-    """Edge functions around a point, ready to be compared with 0 at all sample positions nearby.
+def edge(
+    start: tuple[Int[Array, "*b"], Int[Array, "*b"]],
+    end: tuple[Int[Array, "*b"], Int[Array, "*b"]],
+    point: tuple[Int[Array, "*b"], Int[Array, "*b"]],
+    *,
+    unit: int,
+) -> tuple[Int[Array, "*b"], Float[Array, "*b"]]:
+    """The edge function at a point, ready to be compared with 0 at all sample positions nearby.
 
-    Edge k runs from corner k to corner k+1. With steps i to the right and j down, each of `unit` snapped units, a
-    sample is inside the edge, by the top-left rule, if and only if  c + dx·j - dy·i >= 0  in int32: c is the edge
-    function at (px, py), less 1 for edges that do not own their samples, divided by `unit` and rounded down.
+    With (dx, dy) = end - start, and steps i to the right and j down, each of `unit` snapped units, a sample is inside
+    the edge, by the top-left rule, if and only if  c + dx·j - dy·i >= 0  in int32: c is the edge function at the
+    point, less 1 for edges that do not own their samples, divided by `unit` and rounded down.
 
     Args:
       unit: a power of two.
     Returns:
-      c, dx, dy, and the edge function itself in float32.
+      c, and the edge function itself in float32.
     References:
       Direct3D 11 functional specification, 3.4.2 (top-left rule).
     """
-    start, end = xy, jnp.roll(xy, -1, axis=-2)
-    dx, dy = end[..., 0] - start[..., 0], end[..., 1] - start[..., 1]
+    dx, dy = end[0] - start[0], end[1] - start[1]
     owns = (dy == 0) & (dx > 0) | (dy < 0)
     bias = 1 - owns.astype(jnp.int32)
-    high, low = cross_product(dx, dy, px[..., None] - start[..., 0], py[..., None] - start[..., 1], bias=bias)
+    high, low = cross_product(dx, dy, point[0] - start[0], point[1] - start[1], bias=bias)
     value = to_float(high, low) + bias.astype(jnp.float32)
-    return divide_by(high, low, bits=unit.bit_length() - 1), dx, dy, value
+    return divide_by(high, low, bits=unit.bit_length() - 1), value
 
 
 def screen_barycentrics(

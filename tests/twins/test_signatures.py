@@ -27,7 +27,6 @@ EXCEPTIONS = {
     "vecmath.constant_like": "writes out broadcasts, which torch does by itself",
     "harmonics.sh.order_of": "a detail of how jaxrender reads an array's shape",
     "harmonics.sh.bands": "a table of jaxrender's own method",
-    "harmonics.sh.basis_columns": "the recurrence behind sh_basis; the twin has none",
     "harmonics.sh.rotation_table": "a table of jaxrender's own method; the twin rotates by projection",
     "harmonics.sh.sphere_quadrature": "torchref keeps its rules in a private file",
     "harmonics.zh_fit.greedy_axes": "where jaxrender starts its search; the twin starts from a grid",
