@@ -2,7 +2,7 @@
 
 import math
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from jaxrender import console
 from jaxrender.camera import Camera
 from jaxrender.checks import bad_input
-from jaxrender.deferred.gbuffer import GBuffer
+from jaxrender.deferred.exchange import gbuffer_layers
 from jaxrender.deferred.pipeline import Rendering, render_scene, scene_textures
 from jaxrender.deferred.samples import standard_pattern
 from jaxrender.io import load_scene, write_exr, write_png
@@ -20,7 +20,7 @@ from jaxrender.machine import is_writable_folder
 from jaxrender.scene import Scene, whole_scene_camera
 
 if TYPE_CHECKING:
-    from jaxrender.cli import Render
+    from jaxrender.cli import Render, SceneView
 
 
 def run_render(options: "Render") -> None:
@@ -28,11 +28,8 @@ def run_render(options: "Render") -> None:
     out = options.out.with_suffix(".png")
     if not is_writable_folder(out.parent):
         bad_input("-o", str(out.parent), expected="a folder that can be written", got="one that cannot")
-    scene = builtin_scene() if options.scene is None else load_scene(options.scene)
-    for note in scene.notes:
-        console.announce(f"{scene.name}: {note}")
+    scene, camera = open_view(options)
     width, height = options.size
-    camera = choose_camera(scene, options)
     console.announce_device()
     started = time.perf_counter()
     rendering = render_scene(
@@ -49,7 +46,15 @@ def run_render(options: "Render") -> None:
     console.finish(paths=paths, record=record, as_json=options.json)
 
 
-def choose_camera(scene: Scene, options: "Render") -> Camera:
+def open_view(options: "SceneView") -> tuple[Scene, Camera]:
+    """The scene of the options, or the built-in one, and its camera; says what was odd in the file."""
+    scene = builtin_scene() if options.scene is None else load_scene(options.scene)
+    for note in scene.notes:
+        console.announce(f"{scene.name}: {note}")
+    return scene, choose_camera(scene, options)
+
+
+def choose_camera(scene: Scene, options: "SceneView") -> Camera:
     """The camera of the options, else of the file, else one that sees the whole scene."""
     if options.eye is not None:
         eye, target = (jnp.asarray(v, jnp.float32) for v in (options.eye, options.target))
@@ -63,27 +68,8 @@ def choose_camera(scene: Scene, options: "Render") -> Camera:
 
 
 def picture_layers(rendering: Rendering) -> dict[str, np.ndarray]:
-    """Picture and G-buffer by the usual names of layers: means over covered samples, ids of the first sample."""
-    gbuffer, covered = rendering.gbuffer, np.asarray(rendering.gbuffer.coverage)
-    count = np.maximum(covered.sum(axis=-1, keepdims=True), 1)
-
-    def mean(values: Any) -> np.ndarray:
-        values = np.asarray(values).reshape(*covered.shape, -1)
-        return np.sum(values * covered[..., None], axis=2) / count
-
-    ids = _ids(gbuffer)
-    return {
-        "": np.concatenate([rendering.image, rendering.alpha[..., None]], axis=-1),
-        "albedo": mean(rendering.surface.base_color),
-        "normal": mean(gbuffer.normal),
-        "position": mean(gbuffer.position),
-        "depth": mean(gbuffer.depth),
-        "uv": mean(gbuffer.uv),
-        **ids,
-    }
-
-
-def _ids(gbuffer: GBuffer) -> dict[str, np.ndarray]:
-    """Material and triangle of the first sample, plus 1: 0 is nothing."""
-    first = {"materialid": gbuffer.material_id, "triangleid": gbuffer.triangle_id}
-    return {name: (np.asarray(ids)[:, :, :1] + 1).astype(np.uint32) for name, ids in first.items()}
+    """Picture, albedo and G-buffer by the usual names of layers: means over covered samples."""
+    covered = np.asarray(rendering.gbuffer.coverage)[..., None]
+    albedo = np.sum(np.asarray(rendering.surface.base_color) * covered, axis=2) / np.maximum(covered.sum(axis=2), 1)
+    image = np.concatenate([rendering.image, rendering.alpha[..., None]], axis=-1)
+    return {"": image, "albedo": albedo, **gbuffer_layers(rendering.gbuffer)}

@@ -1,5 +1,7 @@
 """Deferred rendering, with the semantics of a graphics pipeline as tensors: scene -> raster -> G-buffer -> shading."""
 
+from jaxrender.deferred.exchange import gbuffer_from_layers as gbuffer_from_layers
+from jaxrender.deferred.exchange import gbuffer_layers as gbuffer_layers
 from jaxrender.deferred.gbuffer import GBuffer as GBuffer
 from jaxrender.deferred.gbuffer import make_gbuffer as make_gbuffer
 from jaxrender.deferred.interpolate import attribute_gradients as attribute_gradients
@@ -17,6 +19,9 @@ from jaxrender.deferred.late import FragmentList as FragmentList
 from jaxrender.deferred.late import alpha_to_coverage as alpha_to_coverage
 from jaxrender.deferred.late import draw_late as draw_late
 from jaxrender.deferred.late import resolve as resolve
+from jaxrender.deferred.packing import PackedGBuffer as PackedGBuffer
+from jaxrender.deferred.packing import pack_gbuffer as pack_gbuffer
+from jaxrender.deferred.packing import unpack_gbuffer as unpack_gbuffer
 from jaxrender.deferred.pipeline import Rendering as Rendering
 from jaxrender.deferred.pipeline import clip_positions as clip_positions
 from jaxrender.deferred.pipeline import draw_gbuffer as draw_gbuffer

@@ -150,15 +150,14 @@ def _group(channels: tuple[str, ...]) -> dict[str, list[str]]:
     """Layer name -> its channels in order."""
     groups: dict[str, list[str]] = {}
     rest = sorted(channels)
-    for family in _FAMILIES:
-        for prefix in sorted({name.rpartition(".")[0] for name in rest}):
-            if prefix == "" and family != "RGBA":
-                continue  # a bare Z is depth and a bare Y is luminance
-            found = {name.rpartition(".")[2].upper(): name for name in rest if name.rpartition(".")[0] == prefix}
-            members = [found[component] for component in family if component in found]
-            if members and prefix not in groups and prefix not in channels:
-                groups[prefix] = members
-                rest = [name for name in rest if name not in members]
+    for prefix in sorted({name.rpartition(".")[0] for name in rest}):
+        found = {name.rpartition(".")[2].upper(): name for name in rest if name.rpartition(".")[0] == prefix}
+        # A bare Z is depth and a bare Y is luminance. Of U, V and A, as Blender writes them, U and V belong together.
+        families = _FAMILIES if prefix else _FAMILIES[:1]
+        members = max(([found[c] for c in family if c in found] for family in families), key=len)
+        if members and prefix not in channels:
+            groups[prefix] = members
+            rest = [name for name in rest if name not in members]
     numbered: dict[str, list[tuple[int, str]]] = {}
     for name in rest:
         prefix, _, suffix = name.rpartition(".")

@@ -210,6 +210,42 @@ def side_by_side(images: Sequence[np.ndarray], labels: Sequence[str] = ()) -> UI
     return contact_sheet(images, labels=labels)
 
 
+def with_color_bar(
+    image: np.ndarray,
+    colors: Float[np.ndarray, "n 3"],
+    *,
+    title: str,
+    low: str,
+    high: str,
+    background: tuple[int, int, int] = (24, 26, 30),
+    text_color: tuple[int, int, int] = (222, 225, 230),
+) -> UInt8[np.ndarray, "h w 3"]:
+    """An image with a strip below it that says what its colors mean: title, lowest value, bar, highest; display bytes.
+
+    A title too long for the image is cut with an ellipsis.
+
+    Args:
+      colors: of the bar, from low to high, linear.
+      low, high: the values at its ends, as text.
+    """
+    pixels = to_bytes(image)
+    width = pixels.shape[1]
+    size = int(np.clip(width // 56, 11, 26))
+    font = PIL.ImageFont.load_default(size)
+    gap, bar_width = round(0.6 * size), max(width // 4, 1)
+    strip = PIL.Image.new("RGB", (width, round(2.2 * size)), background)
+    draw, middle = PIL.ImageDraw.Draw(strip), strip.height / 2
+    right = width - gap - round(font.getlength(high))
+    left = right - gap - bar_width
+    bar = as_pillow(to_bytes(colors[None])).resize((bar_width, size), PIL.Image.Resampling.BILINEAR)
+    strip.paste(bar, (left, (strip.height - size) // 2))
+    draw.text((right, middle), high, fill=text_color, font=font, anchor="lm")
+    draw.text((left - gap, middle), low, fill=text_color, font=font, anchor="rm")
+    room = left - 3 * gap - font.getlength(low)
+    draw.text((gap, middle), _fit_text(title, font, room), fill=text_color, font=font, anchor="lm")
+    return np.concatenate([np.asarray(as_pillow(pixels).convert("RGB")), np.asarray(strip)])
+
+
 def _fit_text(text: str, font, width: int | float) -> str:
     if font.getlength(text) <= width:
         return text
