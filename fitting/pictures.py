@@ -18,6 +18,15 @@ from jaxrender.animation.skeleton import Pose, sample_clip
 from jaxrender.animation.skinning import Character, SkinnedMesh
 from jaxrender.camera import Camera, frame_bounds, look_at
 from jaxrender.checks import bad_input
+from jaxrender.deferred.preview import (
+    blur_environment,
+    color_surface,
+    environment_background,
+    gradient_background,
+    lay_over,
+    visible_surface,
+)
+from jaxrender.deferred.raster import Fragments
 from jaxrender.harmonics.light import (
     environment_directions,
     project_environment,
@@ -31,15 +40,6 @@ from jaxrender.io.exr import write_exr
 from jaxrender.io.hdr import read_environment
 from jaxrender.io.picture import side_by_side, to_bytes, tone_map, write_animation, write_png
 from jaxrender.metrics import heatmap
-from jaxrender.pathtrace.preview import (
-    VisibleSurface,
-    blur_environment,
-    color_surface,
-    environment_background,
-    gradient_background,
-    lay_over,
-    visible_surface,
-)
 
 MEMBRANE_TRANSMISSION = (0.75, 0.4, 0.22)
 # Stills show shape and shadow, not the character's paint.
@@ -226,14 +226,14 @@ def _telling_frame(motion: Motion, evaluation: Evaluation) -> int:
 
 @dataclass(frozen=True)
 class Still:
-    """One pose, drawn in several ways with the same camera rays and the same traced visibility."""
+    """One pose, drawn in several ways with the same view and the same traced visibility."""
 
     character: Character
     model: PoseModel
     pose: Pose
     mesh: SkinnedMesh
     camera: Camera
-    surface: VisibleSurface
+    surface: Fragments
     num_directions: int
     traced: tuple
 
@@ -265,7 +265,7 @@ class Still:
         measured = np.isfinite(of_vertex)
         values = np.stack([np.where(measured, of_vertex / high, 0.0), measured], axis=-1)
         back = make_still(
-            self.character, self.model, self.pose, size=len(self.surface.triangle) // self.surface.samples_per_axis,
+            self.character, self.model, self.pose, size=len(self.surface.triangle_id),
             azimuth_degrees=205.0, num_directions=0,
         )  # fmt: skip
         images = [still._shown(values, _heat_where_measured) for still in (self, back)]
@@ -274,7 +274,7 @@ class Still:
 
     def _shown(self, values: Float[np.ndarray, "v c"], display: Callable) -> Float[np.ndarray, "h w 3"]:
         """Values on the mesh through a transfer to display-linear, before the backdrop."""
-        image, alpha = color_surface(self.surface, np.asarray(self.character.faces), values)
+        image, alpha = color_surface(self.surface, values)
         shown = display(image / np.maximum(alpha, 1e-6)[..., None]) * alpha[..., None]
         height, width = alpha.shape
         return lay_over(shown, alpha, gradient_background(height, width, top=BACKDROP_TOP, bottom=BACKDROP_BOTTOM))
@@ -290,7 +290,7 @@ def make_still(
     elevation_degrees: float = 10.0,
     num_directions: int = 1024,
 ) -> Still:
-    """Casts the camera's rays and the visibility rays of one pose.
+    """Rasterises one pose and casts its visibility rays.
 
     Args:
       size: height of a picture in pixels; its width follows the character.
@@ -429,12 +429,12 @@ class _Shots:
             mesh, points, bits, material=self.film.material, num_directions=num_directions, **self._options(phase)
         )  # fmt: skip
 
-    def see(self, positions: np.ndarray) -> VisibleSurface:
+    def see(self, positions: np.ndarray) -> Fragments:
         width, height = self.film.size
         return visible_surface(positions, self.faces, self.camera, height=height, width=width)
 
-    def draw(self, surface: VisibleSurface, colors: np.ndarray, phase: float) -> np.ndarray:
-        image, alpha = color_surface(surface, self.faces, colors)
+    def draw(self, surface: Fragments, colors: np.ndarray, phase: float) -> np.ndarray:
+        image, alpha = color_surface(surface, colors)
         height, width = alpha.shape
         turned = rotate_environment(self.environment, self._angle(phase))
         return lay_over(

@@ -270,8 +270,8 @@ def _check_indices(faces: Int[Array, "t 3"], num_vertices: int) -> None:
 
 
 def room_for(count: int) -> int:
-    """At least `count`, in steps of an eighth or less or of 256, so that few different programs are compiled."""
-    step = max(256, 1 << max(count.bit_length() - 4, 0))
+    """At least `count`, in steps of a quarter or less or of 256: frames of a film compile few different programs."""
+    step = max(256, 1 << max(count.bit_length() - 3, 0))
     return -(-max(count, 1) // step) * step
 
 

@@ -1,31 +1,21 @@
-"""Vertex colors to an image by first-hit rays, the stand-in for a rasteriser: what `fitting` draws its pictures with.
+"""A mesh with a color per vertex -> an image: what `fitting` draws its pictures with.
 
-Works on one image; NumPy in, NumPy out, not differentiable. The rays of a pose are cast once (`visible_surface`);
-coloring it anew, under a light that turns say, costs no ray.
+Works on one image; NumPy in, NumPy out, not differentiable. What is seen of a pose is found once (`visible_surface`);
+coloring it anew, under a light that turns say, costs no rasterisation.
 """
 
-from dataclasses import dataclass
+import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from jaxrender.camera import Camera, camera_rays
-from jaxrender.checks import check_at_least
-from jaxrender.pathtrace.embree import EmbreeScene
-
-
-@dataclass(frozen=True)
-class VisibleSurface:
-    """What an image shows of a mesh: for each sample the face (-1: nothing) and where on it.
-
-    A pixel has samples_per_axis² samples in a regular grid; the samples of an image form one of that many rows and
-    columns more, row 0 on top. `barycentrics` are (u, v): the point is (1 - u - v) a + u b + v c.
-    """
-
-    triangle: Int[np.ndarray, "hs ws"]
-    barycentrics: Float[np.ndarray, "hs ws 2"]
-    samples_per_axis: int
+from jaxrender.camera import Camera, camera_rays, clip_from_world, depth_range
+from jaxrender.deferred.interpolate import interpolate
+from jaxrender.deferred.raster import Fragments, rasterize
+from jaxrender.deferred.samples import ordered_grid
 
 
 def visible_surface(
@@ -36,21 +26,21 @@ def visible_surface(
     height: int,
     width: int,
     samples_per_axis: int = 2,
-) -> VisibleSurface:
-    """Casts one ray per sample. Both sides of a face are seen."""
-    check_at_least("samples_per_axis", samples_per_axis, 1)
-    size = height * samples_per_axis, width * samples_per_axis
-    # About the eye, so that Embree's single precision does not suffer far from the origin.
-    _, directions = camera_rays(camera, height=size[0], width=size[1])
+) -> Fragments:
+    """What an image shows of a mesh, in a regular grid of samples_per_axis² samples a pixel. Faces have two sides."""
+    # About the eye, so that single precision does not suffer far from the origin.
     eye = np.asarray(camera.eye, np.float64)
-    scene = EmbreeScene(np.asarray(positions, np.float64) - eye, faces)
-    rays = np.ascontiguousarray(np.asarray(directions, np.float32).reshape(-1, 3))
-    hits = scene.closest_hit(np.zeros_like(rays), rays)
-    return VisibleSurface(hits.triangle.reshape(size), hits.barycentrics.reshape(*size, 2), samples_per_axis)
+    about = jnp.asarray(np.asarray(positions, np.float64) - eye, jnp.float32)
+    ahead = jnp.asarray(np.asarray(camera.target, np.float64) - eye, jnp.float32)
+    own = dataclasses.replace(camera, eye=jnp.zeros(3, jnp.float32), target=ahead)
+    near, far = depth_range(own, about.min(axis=0), about.max(axis=0))
+    matrix = clip_from_world(own, height=height, width=width, near=near, far=far)
+    clip = jnp.pad(about, ((0, 0), (0, 1)), constant_values=1.0) @ matrix.T
+    return rasterize(clip, jnp.asarray(faces), height=height, width=width, samples=ordered_grid(samples_per_axis))
 
 
 def color_surface(
-    surface: VisibleSurface, faces: Int[np.ndarray, "t 3"], colors: Float[np.ndarray, "v c"]
+    surface: Fragments, colors: Float[np.ndarray, "v c"]
 ) -> tuple[Float[np.ndarray, "h w c"], Float[np.ndarray, "h w"]]:
     """The surface with a color per vertex, linear over each face, and the share of each pixel that it covers.
 
@@ -59,24 +49,17 @@ def color_surface(
     Returns:
       the mean color over all samples of a pixel, with 0 where nothing is hit (premultiplied), and the coverage.
     """
-    hit = surface.triangle >= 0
-    corners = np.maximum(np.asarray(colors, np.float32), 0.0)[np.asarray(faces)[surface.triangle[hit]]]
-    u, v = surface.barycentrics[hit].T
-    share = np.stack([1.0 - u - v, u, v], axis=-1)
-    samples = np.zeros((*hit.shape, corners.shape[-1]), np.float32)
-    samples[hit] = np.sum(share[:, :, None] * corners, axis=1)
-    return _mean_of_samples(samples, surface.samples_per_axis), coverage(surface)
+    return np.asarray(_mean_color(surface, jnp.asarray(colors, jnp.float32))), coverage(surface)
 
 
-def coverage(surface: VisibleSurface) -> Float[np.ndarray, "h w"]:
+@jax.jit
+def _mean_color(surface: Fragments, colors: Float[Array, "v c"]) -> Float[Array, "h w c"]:
+    return jnp.mean(interpolate(surface, jnp.maximum(colors, 0.0)), axis=2)
+
+
+def coverage(surface: Fragments) -> Float[np.ndarray, "h w"]:
     """The share of each pixel that shows the mesh, 0 to 1."""
-    covered = (surface.triangle >= 0).astype(np.float32)[..., None]
-    return _mean_of_samples(covered, surface.samples_per_axis)[..., 0]
-
-
-def _mean_of_samples(samples: np.ndarray, n: int) -> np.ndarray:
-    h, w, c = samples.shape
-    return samples.reshape(h // n, n, w // n, n, c).mean(axis=(1, 3))
+    return np.asarray(surface.coverage).mean(axis=-1, dtype=np.float32)
 
 
 def lay_over(
@@ -130,7 +113,7 @@ def render_vertex_colors(
     samples_per_axis: int = 2,
     background: tuple[float, float, float] | Float[np.ndarray, "h w 3"] = (0.0, 0.0, 0.0),
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """Draws a mesh with a color per vertex, antialiased by samples_per_axis² rays a pixel.
+    """Draws a mesh with a color per vertex, antialiased by samples_per_axis² samples a pixel.
 
     Args:
       colors: linear radiance; below 0 counts as 0.
@@ -139,6 +122,6 @@ def render_vertex_colors(
       the linear image and the share of each pixel that the mesh covers.
     """
     surface = visible_surface(positions, faces, camera, height=height, width=width, samples_per_axis=samples_per_axis)
-    image, alpha = color_surface(surface, faces, colors)
+    image, alpha = color_surface(surface, colors)
     behind = np.broadcast_to(np.asarray(background, np.float32), image.shape)
     return lay_over(image, alpha, behind), alpha
