@@ -83,17 +83,15 @@ class Relight:
 
 
 @dataclass(frozen=True)
-class Render:
-    """Renders a scene by rasterisation and deferred shading: a PNG, and with --exr the G-buffer as layers."""
+class SceneView:
+    """A scene, and how an image is taken of it: what the commands that rasterise are told."""
 
     scene: tyro.conf.Positional[Path | None] = None
     """A glTF, GLB, PLY or OBJ file, or a scene.json. Without one, a built-in scene."""
-    out: Out = Path("out/render.png")
-    """The picture; with --exr a file of the same name ending in .exr is written beside it."""
     size: tuple[int, int] = (1024, 768)
     """Width and height in pixels."""
-    samples: int = 4
-    """Samples a pixel: 1, 2, 4, 8 or 16, all shaded."""
+    samples: int = 1
+    """Samples a pixel: 1, 2, 4, 8 or 16."""
     camera: int = 0
     """Which of the file's cameras; without any, the whole scene is framed."""
     eye: tuple[float, float, float] | None = None
@@ -102,12 +100,6 @@ class Render:
     """What to look at, if --eye is given."""
     fov_degrees: float = 60.0
     """Vertical field of view, if --eye is given."""
-    exposure_stops: float = 0.0
-    """Brightens the PNG by powers of two."""
-    exr: bool = False
-    """Also write linear radiance, albedo, normals, position, depth, uv and ids as layers of an OpenEXR file."""
-    json: bool = False
-    """Print one JSON object instead of the list of files."""
 
     def __post_init__(self):
         if min(self.size) < 1:
@@ -117,11 +109,47 @@ class Render:
         if not 0.0 < self.fov_degrees < 180.0:
             raise ValueError(f"--fov-degrees: expected an angle between 0 and 180, got {self.fov_degrees}")
 
+
+@dataclass(frozen=True)
+class Render(SceneView):
+    """Renders a scene by rasterisation and deferred shading: a PNG, and with --exr the G-buffer as layers."""
+
+    out: Out = Path("out/render.png")
+    """The picture; with --exr a file of the same name ending in .exr is written beside it."""
+    samples: int = 4
+    """Samples a pixel: 1, 2, 4, 8 or 16, all shaded."""
+    exposure_stops: float = 0.0
+    """Brightens the PNG by powers of two."""
+    exr: bool = False
+    """Also write linear radiance, albedo, normals, position, depth, uv and ids as layers of an OpenEXR file."""
+    json: bool = False
+    """Print one JSON object instead of the list of files."""
+
     def run(self) -> None:
         from jaxrender.render_command import run_render
 
         console.enable_compilation_cache()
         run_render(self)
+
+
+@dataclass(frozen=True)
+class Quads(SceneView):
+    """Shows what shading in 2x2 quads costs for a scene: helper lanes, overdraw, warps, lockstep, in numbers and maps.
+
+    All quads are those of a forward renderer without a depth test; the visible ones are left after a perfect early
+    depth test.
+    """
+
+    out: Out = Path("out/quads")
+    """Folder for the pictures."""
+    json: bool = False
+    """Print one JSON object instead of the tables and the list of files."""
+
+    def run(self) -> None:
+        from jaxrender.quads_command import run_quads
+
+        console.enable_compilation_cache()
+        run_quads(self)
 
 
 @dataclass(frozen=True)
@@ -152,7 +180,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"jaxrender {doctor.package_version('jaxrender')}")
         return 0
     description = "Real-time rendering methods as pure tensor kernels."
-    commands = Demo | Render | Relight | Doctor
+    commands = Demo | Render | Quads | Relight | Doctor
     return console.run_command(
         lambda: console.parse(commands, prog="jaxrender", description=description, argv=argv).run()
     )

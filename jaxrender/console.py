@@ -12,13 +12,14 @@ import os
 import pathlib
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 import rich.console
 import rich.progress
+import rich.table
 import tyro
 
 import jaxrender.checks
@@ -236,6 +237,20 @@ def to_jsonable(value: Any) -> Any:
 def print_json(value: Any) -> None:
     """Prints `value` as one strict JSON object on standard output."""
     print(json.dumps(to_jsonable(value), indent=2, allow_nan=False, ensure_ascii=False))
+
+
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Prints a table on standard output: texts to the left in the first column, numbers to the right in the others."""
+    table = rich.table.Table(box=None, pad_edge=False, header_style="")
+    for index, name in enumerate(columns):
+        table.add_column(name, justify="right" if index else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    # Wide enough for any table: rich would cut cells to fit a narrow terminal, and a file has no width at all.
+    stdout = rich.console.Console(markup=False, highlight=False, emoji=False, width=1000)
+    stdout.print(title, style="bold")
+    stdout.print(table)
+    stdout.print()
 
 
 def finish(*, paths: Iterable[str | os.PathLike], record: Mapping[str, Any], as_json: bool) -> None:

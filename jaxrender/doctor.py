@@ -21,7 +21,7 @@ PACKAGES = (
 #: What each extra adds, in the user's words.
 EXTRAS = {
     "torch": "the readable PyTorch twins (torchref) and kornia to compare with",
-    "plots": "plots in the HTML reports",
+    "plots": "plots in the HTML reports, the chart of `jaxrender quads`",
     "peers": "other libraries that the benchmarks and tests measure against",
     "cluster": "baking on several machines",
     "dev": "the test runner, linter and type checker",

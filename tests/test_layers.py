@@ -13,7 +13,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 PACKAGES = ("jaxrender", "torchref", "fitting", "benchmarks")
 
 GROUND = {"scene", "camera", "vecmath", "warp", "brdf", "metrics", "checks", "machine", "srgb", "sh_basis"}
-COMMANDS = {"cli", "console", "doctor", "render_command"}
+COMMANDS = {"cli", "console", "doctor", "render_command", "quads_command", "quad_costs"}
 
 #: Part of jaxrender -> the other parts it may import. Data runs from the first line to the last.
 MAY_IMPORT: dict[str, set[str]] = {

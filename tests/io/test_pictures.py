@@ -162,6 +162,18 @@ def test_labels_are_drawn_above_and_fit():
     assert not text[128:136].any() and not text[256:].any()
 
 
+def test_a_color_bar_stands_below_the_picture(rng):
+    image = rng.random((30, 200, 3)).astype(np.float32)
+    colors = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 16)
+    sheet = picture.with_color_bar(image, colors, title="a title much too long for it", low="0", high="7")
+    assert sheet.dtype == np.uint8 and sheet.shape[1:] == (200, 3) and sheet.shape[0] > 40
+    np.testing.assert_array_equal(sheet[:30], picture.to_bytes(image))
+    middle = sheet[30 + (sheet.shape[0] - 30) // 2].astype(int)
+    (red,) = np.nonzero((middle[:, 0] > 60) & (middle[:, 1:].max(axis=-1) < 5))
+    assert len(red) > 30 and (np.diff(middle[red, 0]) >= 0).all() and middle[red[-1], 0] > 250
+    assert picture.with_color_bar(image[:1, :1, :1], colors, title="t", low="0", high="1").shape[1:] == (1, 3)
+
+
 def test_sheet_arguments():
     with pytest.raises(ValueError, match="images: expected at least one"):
         picture.contact_sheet([])
