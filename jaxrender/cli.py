@@ -4,7 +4,7 @@ import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -98,8 +98,10 @@ class SceneView:
     """Where to look from, in the scene's units; then --target says where to."""
     target: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """What to look at, if --eye is given."""
+    inside: bool = False
+    """Look from inside the scene along its longer side, as in a building."""
     fov_degrees: float = 60.0
-    """Vertical field of view, if --eye is given."""
+    """Vertical field of view, with --eye or --inside."""
 
     def __post_init__(self):
         if min(self.size) < 1:
@@ -118,6 +120,12 @@ class Render(SceneView):
     """The picture; with --exr a file of the same name ending in .exr is written beside it."""
     samples: int = 4
     """Samples a pixel: 1, 2, 4, 8 or 16, all shaded."""
+    environment: Path | None = None
+    """A lat-long .hdr or .exr map that lights the scene, beside the lights of the file."""
+    model: Literal["metallic_roughness", "phong", "lambert"] = "metallic_roughness"
+    """How surfaces reflect."""
+    transparency: Literal["test", "coverage", "none"] = "test"
+    """What alpha means: discard masked texels, or a share of the samples (blended materials as well), or nothing."""
     exposure_stops: float = 0.0
     """Brightens the PNG by powers of two."""
     exr: bool = False

@@ -168,6 +168,19 @@ def whole_scene_camera(
     )
 
 
+def inside_camera(scene: Scene, *, fov_y_radians: float = 1.05) -> Camera:
+    """A camera inside a building: near one end of its longer side, a fifth up, looking to the other end."""
+    low, high = scene_bounds(scene)
+    x_is_longer = high[0] - low[0] >= high[2] - low[2]
+    along = jnp.where(x_is_longer, jnp.asarray([1.0, 0.0, 0.0], low.dtype), jnp.asarray([0.0, 0.0, 1.0], low.dtype))
+    size = high - low
+    foot = jnp.stack([0.5 * (low[0] + high[0]), low[1] + 0.2 * size[1], 0.5 * (low[2] + high[2])])
+    return Camera(
+        foot + 0.35 * size * along, foot - 0.35 * size * along, jnp.asarray([0.0, 1.0, 0.0], low.dtype),
+        jnp.asarray(fov_y_radians, low.dtype),
+    )  # fmt: skip
+
+
 def vertex_normals(vertices: Float[Array, "*b v 3"], faces: Int[Array, "t 3"]) -> Float[Array, "*b v 3"]:
     """Unit normals: the sum of the face normals around each vertex, weighted by area; 0 at a vertex without faces."""
     a, b, c = (vertices[..., faces[:, i], :] for i in range(3))

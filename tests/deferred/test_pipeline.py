@@ -12,9 +12,10 @@ from jaxrender import cli
 from jaxrender.camera import Camera, camera_rays
 from jaxrender.deferred import make_gbuffer, render_scene, scene_textures, see, standard_pattern
 from jaxrender.deferred.shade import Surface, incoming, shade
-from jaxrender.io import load_scene, read_exr
+from jaxrender.io import load_scene, read_exr, write_exr
 from jaxrender.io.builtin_scene import builtin_scene
 from jaxrender.io.exr import read_exr_layers
+from jaxrender.io.picture import read_png
 from jaxrender.pathtrace.embree import EmbreeScene
 from jaxrender.scene import DIRECTIONAL, MASK, POINT, SPOT, Lights, SceneImage, scene_bounds, whole_scene_camera
 
@@ -173,6 +174,23 @@ def test_render_writes_png_and_layers(tmp_path, capsys):
     assert picture[covered][:, :3].mean() > 0.05
     lengths = np.linalg.norm(layers["normal"][covered], axis=-1)
     assert (lengths <= 1 + 1e-4).all() and np.median(lengths) > 0.99
+
+
+def test_render_with_a_sky_from_inside(tmp_path, capsys):
+    """The sky lights the scene and is what is behind it; alpha as coverage and another model are taken."""
+    sky = np.zeros((16, 32, 3), np.float32)
+    sky[:8] = [0.2, 0.6, 2.0]
+    write_exr(tmp_path / "sky.exr", sky)
+    out = tmp_path / "picture.png"
+    words = ["--environment", str(tmp_path / "sky.exr"), "--inside", "--transparency", "coverage", "--model", "phong"]
+    assert cli.main(["render", "-o", str(out), "--size", "40", "30", *words, "--exr", "--json"]) == 0
+    layers = read_exr_layers(out.with_suffix(".exr"))
+    alpha = layers[""][..., 3]
+    assert 0.02 < alpha.mean() < 0.98
+    lit = layers[""][alpha > 0.9]
+    assert lit[:, 2].mean() > 2.5 * lit[:, 0].mean() > 0
+    shown = read_png(out)
+    assert shown[:5][alpha[:5] == 0][:, 2].mean() > shown[:5][alpha[:5] == 0][:, 0].mean() + 0.2
 
 
 @pytest.mark.parametrize(
