@@ -7,6 +7,7 @@ import pytest
 
 from jaxrender import brdf
 from jaxrender.vecmath import normalize
+from tests.support import oracles
 
 
 def hemisphere(num_z=400, num_phi=64):
@@ -95,3 +96,26 @@ def test_gradients_agree_with_finite_differences(rng):
         h = 1e-2
         slope = (f(material[name] + h * towards) - f(material[name] - h * towards)) / (2 * h)
         np.testing.assert_allclose(jnp.sum(jax.grad(f)(material[name]) * towards), slope, rtol=3e-2, atol=1e-3)
+
+
+@pytest.mark.parametrize("roughness", [0.05, 0.1, 0.2])
+def test_peaks_of_smooth_surfaces_keep_their_digits(roughness, rng):
+    """Half vectors within a few α of the normal, in float32 against float64."""
+    n = oracles.unit(rng.normal(size=(20_000, 3)))
+    wo = oracles.unit(n + 0.8 * rng.normal(size=n.shape) / np.sqrt(3))
+    h = oracles.unit(n + 2 * roughness**2 * rng.normal(size=n.shape))
+    wi = 2 * np.sum(h * wo, axis=1, keepdims=True) * h - wo
+    seen = (np.sum(n * wo, axis=1) > 0.2) & (np.sum(n * wi, axis=1) > 0.2)
+
+    def values(dtype):
+        own = {"base_color": np.ones((1, 3)), "metallic": np.ones((1, 1)), "roughness": np.full((1, 1), roughness)}
+        own = {name: jnp.asarray(np.repeat(v, seen.sum(), axis=0), dtype) for name, v in own.items()}
+        vectors = (jnp.asarray(np.float32(v[seen]), dtype) for v in (wi, wo, n))
+        return np.asarray(brdf.metallic_roughness(*vectors, **own))[:, 0]
+
+    single = values(jnp.float32)
+    with jax.enable_x64(True):
+        double = values(jnp.float64)
+    # The vectors are rounded to float32 in both: what is left is the arithmetic, times the slope of D at its flank.
+    off = np.abs(single / double - 1.0)
+    assert seen.sum() > 5000 and np.quantile(off, 0.99) < 2e-4 * (0.1 / roughness) ** 2 + 2e-5

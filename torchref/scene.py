@@ -1,13 +1,20 @@
-"""What goes into the methods: meshes, and meshes that move."""
+"""What goes into the methods: meshes, meshes that move, and scenes with materials and lights."""
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from torchref._precision import in_float64
+from torchref.camera import Camera, frame_bounds
 from torchref.vecmath import frame_from_normal_tangent, normalize
+
+#: Values of `Material.alpha_mode`.
+OPAQUE, MASK, BLEND = 0, 1, 2
+#: Values of `Lights.kind`.
+DIRECTIONAL, POINT, SPOT = 0, 1, 2
 
 
 @dataclass(frozen=True)
@@ -31,6 +38,103 @@ class MeshSequence:
     @property
     def normals(self) -> Float[Tensor, "f v 3"]:
         return self.frames[..., 2]
+
+
+@dataclass(frozen=True)
+class Material:
+    """Materials of glTF 2.0 by id: factors for what textures give, and for each texture a layer, or -1."""
+
+    base_color: Float[Tensor, "*m 4"]
+    metallic: Float[Tensor, "*m"]
+    roughness: Float[Tensor, "*m"]
+    emissive: Float[Tensor, "*m 3"]
+    normal_scale: Float[Tensor, "*m"]
+    occlusion_strength: Float[Tensor, "*m"]
+    alpha_mode: Int[Tensor, "*m"]
+    alpha_cutoff: Float[Tensor, "*m"]
+    double_sided: Bool[Tensor, "*m"]
+    base_color_texture: Int[Tensor, "*m"]
+    metallic_roughness_texture: Int[Tensor, "*m"]
+    normal_texture: Int[Tensor, "*m"]
+    occlusion_texture: Int[Tensor, "*m"]
+    emissive_texture: Int[Tensor, "*m"]
+
+
+@dataclass(frozen=True)
+class Lights:
+    """n lights of KHR_lights_punctual; `direction` is the way the light travels, `range` may be inf."""
+
+    kind: Int[Tensor, " n"]
+    position: Float[Tensor, "n 3"]
+    direction: Float[Tensor, "n 3"]
+    intensity: Float[Tensor, "n 3"]
+    range: Float[Tensor, " n"]
+    cos_inner: Float[Tensor, " n"]
+    cos_outer: Float[Tensor, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneImage:
+    """A decoded picture, and how it is wrapped in u and v."""
+
+    name: str
+    texels: UInt8[np.ndarray, "h w c"]
+    wrap: tuple[str, str]
+    srgb: bool
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One triangle mesh in the world with a material for each triangle, and lights.
+
+    The bitangent of a normal map is w cross(normal, tangent), w the fourth number of `tangents`.
+    """
+
+    positions: Float[Tensor, "v 3"]
+    normals: Float[Tensor, "v 3"]
+    tangents: Float[Tensor, "v 4"]
+    uv: Float[Tensor, "v 2"]
+    colors: Float[Tensor, "v 4"]
+    faces: Int[Tensor, "t 3"]
+    material_id: Int[Tensor, " t"]
+    material: Material
+    lights: Lights
+    cameras: tuple[Camera, ...]
+    name: str
+    images: tuple[SceneImage, ...] = ()
+    material_names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@in_float64
+def scene_bounds(scene: Scene) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Lowest and highest coordinates of the vertices that have triangles."""
+    used = scene.positions[scene.faces.unique().long()]
+    return used.amin(dim=0), used.amax(dim=0)
+
+
+def whole_scene_camera(
+    scene: Scene, *, aspect: int | float = 1.0, azimuth_radians: float = 0.6, elevation_radians: float = 0.35
+) -> Camera:
+    """`frame_bounds` of the scene's box."""
+    low, high = scene_bounds(scene)
+    return frame_bounds(low, high, azimuth_radians=azimuth_radians, elevation_radians=elevation_radians, aspect=aspect)
+
+
+@in_float64
+def inside_camera(scene: Scene, *, fov_y_radians: float = 1.05) -> Camera:
+    """In the middle of the scene's box but for its longer side, x or z: 0.85 of the way along it, looking to 0.15.
+
+    Both ends of the view are a fifth of the way up.
+    """
+    low, high = scene_bounds(scene)
+    across, _, ahead = (high - low).unbind()
+    share = torch.tensor([0.5, 0.2, 0.5], dtype=low.dtype, device=low.device)
+    step = torch.zeros_like(share)
+    step[0 if across >= ahead else 2] = 0.35
+    eye, target = (low + (share + sign * step) * (high - low) for sign in (1, -1))
+    fov = torch.as_tensor(fov_y_radians, dtype=low.dtype, device=low.device)
+    return Camera(eye, target, torch.tensor([0.0, 1.0, 0.0], dtype=low.dtype, device=low.device), fov)
 
 
 @in_float64

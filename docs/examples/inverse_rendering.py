@@ -113,7 +113,11 @@ def recover(target: jax.Array, covered: jax.Array, start: Unknown, *, rounds: in
 def painted(size: int = TEXELS) -> jax.Array:
     """Stripes and spots in three colors, (size, size, 3) in [0.1, 0.9]."""
     v, u = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size, indexing="ij")
-    waves = [np.sin(2 * np.pi * (2 * u + v)), np.cos(2 * np.pi * (u - 2 * v)), np.sin(2 * np.pi * 3 * u) * np.cos(6 * v)]
+    waves = [
+        np.sin(2 * np.pi * (2 * u + v)),
+        np.cos(2 * np.pi * (u - 2 * v)),
+        np.sin(2 * np.pi * 3 * u) * np.cos(6 * v),
+    ]
     return jnp.asarray(0.5 + 0.4 * np.stack(waves, axis=-1), jnp.float32)
 
 

@@ -5,6 +5,7 @@ cross the near plane or leave the guard band are cut; what is left of them is a 
 depth test a sample.
 """
 
+import functools
 from dataclasses import dataclass
 
 import jax
@@ -48,17 +49,27 @@ def _planes(*, height: int, width: int) -> Float[np.ndarray, "5 4"]:
     return np.array([[0, 0, 1, 0], [-1, 0, 0, gx], [1, 0, 0, gx], [0, -1, 0, gy], [0, 1, 0, gy]], np.float32)
 
 
-def sort_out(corners: Float[Array, "t 3 4"], *, height: int, width: int) -> tuple[Bool[Array, " t"], Bool[Array, " t"]]:
+def sort_out(
+    clip: Float[Array, "v 4"], faces: Int[Array, "t 3"], *, height: int, width: int
+) -> tuple[Bool[Array, " t"], Bool[Array, " t"]]:
     """Which triangles can be drawn as they are, and which have to be cut first.
 
     Triangles with a corner that is not finite, and those wholly outside one plane of the picture, are neither.
+
+    References:
+      Outcodes: Newman, Sproull, "Principles of Interactive Computer Graphics", 1973 (Cohen, Sutherland).
     """
-    planes = jnp.asarray(_planes(height=height, width=width), corners.dtype)
-    inside = jnp.einsum("tck,pk->tcp", corners, planes, precision="highest") >= 0.0
-    x, y, z, w = (corners[..., i] for i in range(4))
-    sides = jnp.stack([w - x, w + x, w - y, w + y, z, w - z], axis=-1)
-    seen = ~(sides < 0.0).all(axis=1).any(axis=-1) & jnp.isfinite(corners).all(axis=(1, 2))
-    whole = inside.all(axis=(1, 2)) & (w > 0.0).all(axis=1)
+    planes = _planes(height=height, width=width)
+    x, y, z, w = (clip[:, i] for i in range(4))
+    sides = [w - x < 0.0, w + x < 0.0, w - y < 0.0, w + y < 0.0, z < 0.0, w - z < 0.0]
+    guard = [~(x * p[0] + y * p[1] + z * p[2] + w * p[3] >= 0.0) for p in planes] + [~(w > 0.0)]
+    bits = [*sides, *guard, ~jnp.isfinite(clip).all(axis=1)]
+    codes = functools.reduce(jnp.bitwise_or, [jnp.asarray(bit, jnp.int32) << k for k, bit in enumerate(bits)])
+    a, b, c = (codes[faces[:, k]] for k in range(3))
+    of_sides, of_guard = (1 << len(sides)) - 1, ((1 << len(guard)) - 1) << len(sides)
+    every, some = a & b & c, a | b | c
+    seen = (every & of_sides == 0) & (some >> (len(sides) + len(guard)) == 0)
+    whole = some & of_guard == 0
     return seen & whole, seen & ~whole
 
 
@@ -75,7 +86,7 @@ def clip_triangles(
       Sutherland, Hodgman, "Reentrant Polygon Clipping", 1974.
     """
     corners = clip[faces]
-    whole, cut = sort_out(corners, height=height, width=width)
+    whole, cut = sort_out(clip, faces, height=height, width=width)
     num_triangles = len(faces)
     identity = jnp.broadcast_to(jnp.eye(3, dtype=clip.dtype), (num_triangles, 3, 3))
     every = jnp.arange(num_triangles, dtype=jnp.int32)
@@ -132,4 +143,4 @@ def _cut(polygon: Float[Array, "c 7"], count: Int[Array, ""], plane: Float[Array
     place = jnp.cumsum(emitted) - emitted
     result = jnp.zeros_like(polygon).at[jnp.where(kept > 0, place, _CORNERS)].set(polygon, mode="drop")
     result = result.at[jnp.where(leaves_or_enters, place + kept, _CORNERS)].set(crossing, mode="drop")
-    return result, jnp.sum(emitted)
+    return result, jnp.sum(emitted, dtype=jnp.int32)

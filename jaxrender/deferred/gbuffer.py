@@ -100,7 +100,7 @@ def attribute_table(
 
 def plane_slopes(triangles: ScreenTriangles) -> Float[Array, "n 6"]:
     """Steps of 1/w, b_1/w and b_2/w, which are linear on the screen, per pixel to the right, then downwards."""
-    xy, over_w = triangles.xy.astype(jnp.float32), safe_div(jnp.ones_like(triangles.w), triangles.w)
+    xy, over_w = triangles.xy.astype(triangles.w.dtype), safe_div(jnp.ones_like(triangles.w), triangles.w)
     planes = [over_w, triangles.weights[..., 1] * over_w, triangles.weights[..., 2] * over_w]
     scale = SUBPIXELS / triangles.area
     # Of the weight of corner k: the edge opposite to it, turned by a quarter.

@@ -277,7 +277,7 @@ def room_for(count: int) -> int:
 
 @functools.partial(jax.jit, static_argnames=("height", "width"))
 def _count_clipped(clip, faces, *, height, width):
-    return jnp.sum(sort_out(clip[faces], height=height, width=width)[1])
+    return jnp.sum(sort_out(clip, faces, height=height, width=width)[1])
 
 
 @functools.partial(jax.jit, static_argnames=("grid", "cull", "max_clipped"))

@@ -5,6 +5,7 @@ everything but ids.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
@@ -18,11 +19,12 @@ from jaxrender.deferred.gbuffer import GBuffer
 from jaxrender.deferred.texture import Textures, sample_texture_grad
 from jaxrender.scene import DIRECTIONAL, SPOT, Lights, Material
 from jaxrender.sh_basis import basis_columns
-from jaxrender.vecmath import einsum, safe_div, safe_sqrt
 
 #: Fields of `Material` that name a texture, but for the normal map, which is part of the G-buffer.
 TEXTURE_SLOTS = ("base_color_texture", "metallic_roughness_texture", "occlusion_texture", "emissive_texture")
 MODELS = ("metallic_roughness", "phong", "lambert")
+
+Vector = tuple[Array, ...]
 
 
 @jax.tree_util.register_dataclass
@@ -104,35 +106,42 @@ def shade(
       Exponent of Phong for the roughness of facets: Walter et al., "Microfacet Models for Refraction", 2007, 5.2.
     """
     check_one_of("model", model, MODELS)
-    # Components come first from here on: a vector instruction then works on samples, not on x, y and z.
-    front = lambda values: jnp.moveaxis(values, -1, 0)  # noqa: E731
-    position, n, geometric = (front(v) for v in (gbuffer.position, gbuffer.normal, gbuffer.geometric_normal))
-    wo = _unit(_along(eye, position) - position)
-    n_o, roughness = _dot(n, wo), surface.roughness[..., 0]
-    diffuse, mirrored = (front(v) for v in _colors(surface, model))
+    # From here on each component is an array of its own: a vector instruction then works on eight samples, not on x, y
+    # and z of one.
+    shape = gbuffer.position.shape
+    part = lambda values: tuple(values.reshape(-1, 3)[:, i] for i in range(3))  # noqa: E731
+    position, n, geometric = (part(v) for v in (gbuffer.position, gbuffer.normal, gbuffer.geometric_normal))
+    wo = _unit(tuple(eye[i] - position[i] for i in range(3)))
+    n_o, roughness = _dot(n, wo), surface.roughness.reshape(-1)
+    diffuse, mirrored = (part(v) for v in _colors(surface, model))
     exponent = 2.0 / jnp.maximum(roughness * roughness, 1e-3) ** 2 - 2.0
 
-    def add(radiance: Array, light: Lights) -> tuple[Array, None]:
+    def add(radiance: Vector, light: Lights) -> tuple[Vector, None]:
         wi, irradiance = _incoming(light, position)
-        n_i = _dot(n, wi)
+        n_i, i_o = _dot(n, wi), _dot(wi, wo)
         # Light from behind the triangle itself must not leak in through a bent normal.
         cosine = jnp.where(_dot(geometric, wi) > 0.0, jnp.maximum(n_i, 0.0), 0.0) * irradiance
         if model == "metallic_roughness":
-            lobe, schlick = ggx(n_i, n_o, _dot(wi, wo), roughness)
-            fresnel = mirrored + (1.0 - mirrored) * schlick[None]
-            f = (1.0 - fresnel) * jnp.where(n_o > 0.0, 1.0 / math.pi, 0.0)[None] * diffuse + fresnel * lobe[None]
+            v = tuple(wi[i] + wo[i] for i in range(3))
+            off_axis = tuple(v[i] - (n_i + n_o) * n[i] for i in range(3))
+            sin2_h = _dot(off_axis, off_axis) / jnp.maximum(_dot(v, v), 1e-12)
+            lobe, schlick = ggx(n_i, n_o, i_o, roughness, sin2_h=sin2_h)
+            matt = jnp.where(n_o > 0.0, 0.96 * (1.0 - schlick) / math.pi, 0.0)
+            f = [matt * d + (f0 + (1.0 - f0) * schlick) * lobe for f0, d in zip(mirrored, diffuse, strict=True)]
         elif model == "phong":
-            f = diffuse / math.pi + mirrored * phong_lobe(n_i, n_o, _dot(wi, wo), exponent)[None]
+            lobe = phong_lobe(n_i, n_o, i_o, exponent)
+            f = [d / math.pi + r * lobe for r, d in zip(mirrored, diffuse, strict=True)]
         else:
-            f = diffuse / math.pi
-        return radiance + f * cosine[None] * _along(light.intensity, position), None
+            f = [d / math.pi for d in diffuse]
+        return tuple(radiance[i] + f[i] * cosine * light.intensity[i] for i in range(3)), None
 
-    start = front(surface.emissive)
+    start = part(surface.emissive)
     if ambient is not None:
         around = _ambient(n, wo, diffuse, mirrored, roughness, exponent, ambient, glossy=model != "lambert")
-        start += around * surface.occlusion[..., 0][None]
+        occlusion = surface.occlusion.reshape(-1)
+        start = tuple(start[i] + around[i] * occlusion for i in range(3))
     radiance, _ = jax.lax.scan(add, start, lights)
-    return jnp.moveaxis(jnp.where(gbuffer.coverage[None], radiance, 0.0), 0, -1)
+    return jnp.where(gbuffer.coverage[..., None], jnp.stack(radiance, axis=-1).reshape(shape), 0.0)
 
 
 def _colors(surface: Surface, model: str) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
@@ -149,29 +158,29 @@ def incoming(light: Lights, position: Float[Array, "*b 3"]) -> tuple[Float[Array
     References:
       KHR_lights_punctual: inverse square, the recommended range window, the smooth cone of a spot.
     """
-    wi, falloff = _incoming(light, jnp.moveaxis(position, -1, 0))
-    return jnp.moveaxis(wi, 0, -1), falloff[..., None] * jnp.broadcast_to(light.intensity, position.shape)
+    wi, falloff = _incoming(light, tuple(position[..., i] for i in range(3)))
+    return jnp.stack(wi, axis=-1), falloff[..., None] * jnp.broadcast_to(light.intensity, position.shape)
 
 
-def _incoming(light: Lights, position: Float[Array, "3 *b"]) -> tuple[Float[Array, "3 *b"], Float[Array, "*b"]]:
-    """Direction to a light, and what part of its intensity arrives; components first."""
-    away = _along(light.position, position) - position
+def _incoming(light: Lights, position: Vector) -> tuple[Vector, Float[Array, " n"]]:
+    """Direction to a light, and what part of its intensity arrives."""
+    away = tuple(light.position[i] - position[i] for i in range(3))
     distance2 = _dot(away, away)
-    parallel = light.kind == DIRECTIONAL
-    axis = _along(light.direction, position)
-    wi = jnp.where(parallel, -axis, _unit(away))
+    parallel, inverse = light.kind == DIRECTIONAL, _inverse_root(distance2)
+    wi = tuple(jnp.where(parallel, -light.direction[i], away[i] * inverse) for i in range(3))
     # range is inf for lights that do not end.
-    window = jnp.clip(1.0 - (distance2 / light.range**2) ** 2, 0.0, 1.0)
-    falloff = jnp.where(parallel, 1.0, safe_div(window, distance2))
-    width = jnp.maximum(light.cos_inner - light.cos_outer, 1e-4)
-    cone = jnp.clip((-_dot(wi, axis) - light.cos_outer) / width, 0.0, 1.0) ** 2
+    window = jnp.clip(1.0 - (distance2 * (1.0 / light.range) ** 2) ** 2, 0.0, 1.0)
+    falloff = jnp.where(parallel, 1.0, window * inverse * inverse)
+    width = jnp.maximum(light.cos_inner - light.cos_outer, 1e-3)
+    cosine = -(wi[0] * light.direction[0] + wi[1] * light.direction[1] + wi[2] * light.direction[2])
+    cone = jnp.clip((cosine - light.cos_outer) / width, 0.0, 1.0) ** 2
     return wi, falloff * jnp.where(light.kind == SPOT, cone, 1.0)
 
 
 def _ambient(
-    n: Float[Array, "3 *b"], wo: Float[Array, "3 *b"], diffuse: Float[Array, "3 *b"], mirrored: Float[Array, "3 *b"],
-    roughness: Float[Array, "*b"], exponent: Float[Array, "*b"], ambient: Float[Array, "3 k"], *, glossy: bool,
-) -> Float[Array, "3 *b"]:  # fmt: skip
+    n: Vector, wo: Vector, diffuse: Vector, mirrored: Vector, roughness: Float[Array, " n"],
+    exponent: Float[Array, " n"], ambient: Float[Array, "3 k"], *, glossy: bool,
+) -> Vector:  # fmt: skip
     """Light from all around: its irradiance on the normal, and its blurred mirror image.
 
     References:
@@ -181,19 +190,30 @@ def _ambient(
     """
     order = math.isqrt(ambient.shape[1])
     check_order(order, ambient.shape[1])
-    bands = np.repeat(np.arange(order), 2 * np.arange(order) + 1)
-    at = lambda direction: jnp.stack(basis_columns(*direction, order=order))  # noqa: E731
-    clamped = ambient * jnp.asarray(_clamped_cosine(order)[bands], ambient.dtype)[None]
-    irradiance = jnp.maximum(einsum("ck,k...->c...", clamped, at(n)), 0.0)
+    clamped = _clamped_cosine(order)
+    irradiance = _band_sum(n, ambient, [float(factor) for factor in clamped])
+    matt = tuple(diffuse[i] * irradiance[i] / math.pi for i in range(3))
     if not glossy:
-        return diffuse * irradiance / math.pi
-    n_o = jnp.clip(_dot(n, wo), 0.0, 1.0)
-    mirror = 2.0 * _dot(n, wo)[None] * n - wo
-    falloff = jnp.exp(jnp.stack([-float(l * l) / (2.0 * jnp.maximum(exponent, 1.0)) for l in range(order)]))[bands]
-    image = jnp.maximum(einsum("ck,k...->c...", ambient, at(mirror) * falloff), 0.0)
-    grazing = jnp.maximum(1.0 - roughness[None], mirrored)
-    fresnel = mirrored + (grazing - mirrored) * ((1.0 - n_o) ** 5)[None]
-    return diffuse * irradiance / math.pi + fresnel * image
+        return matt
+    n_o = _dot(n, wo)
+    mirror = tuple(2.0 * n_o * n[i] - wo[i] for i in range(3))
+    image = _band_sum(
+        mirror, ambient, [jnp.exp(-float(l * l) / (2.0 * jnp.maximum(exponent, 1.0))) for l in range(order)]
+    )
+    grazing = (1.0 - jnp.clip(n_o, 0.0, 1.0)) ** 5
+    fresnel = [f0 + (jnp.maximum(1.0 - roughness, f0) - f0) * grazing for f0 in mirrored]
+    return tuple(matt[i] + fresnel[i] * image[i] for i in range(3))
+
+
+def _band_sum(direction: Vector, light: Float[Array, "3 k"], factors: Sequence[float | Float[Array, " n"]]) -> Vector:
+    """Σ_l factor_l Σ_m L_lm y_lm(direction) by channel, not below 0."""
+    basis = basis_columns(*direction, order=len(factors))
+    channels = []
+    for channel in light:
+        bands = [sum(channel[l * l + m] * basis[l * l + m] for m in range(2 * l + 1)) for l in range(len(factors))]
+        total = sum(factor * band for factor, band in zip(factors, bands, strict=True))
+        channels.append(jnp.maximum(total, 0.0))
+    return tuple(channels)
 
 
 def _clamped_cosine(order: int) -> np.ndarray:
@@ -210,17 +230,19 @@ def _clamped_cosine(order: int) -> np.ndarray:
     return factors[:order]
 
 
-# --- Vectors whose components come first
+# --- Vectors as three arrays
 
 
-def _along(vector: Float[Array, "3"], like: Float[Array, "3 *b"]) -> Float[Array, "3 *#b"]:
-    return vector.astype(like.dtype).reshape(3, *(1,) * (like.ndim - 1))
-
-
-def _dot(a: Float[Array, "3 *#b"], b: Float[Array, "3 *#b"]) -> Float[Array, "*b"]:
+def _dot(a: Vector, b: Vector) -> Float[Array, "*b"]:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _unit(v: Float[Array, "3 *b"]) -> Float[Array, "3 *b"]:
-    length = safe_sqrt(_dot(v, v))
-    return v * safe_div(jnp.ones_like(length), length)[None]
+def _unit(v: Vector) -> Vector:
+    inverse = _inverse_root(_dot(v, v))
+    return tuple(component * inverse for component in v)
+
+
+def _inverse_root(x: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """1/√x, and 0 with slope 0 where x is not positive."""
+    some = x > 0.0
+    return jnp.where(some, 1.0 / jnp.sqrt(jnp.where(some, x, 1.0)), 0.0)

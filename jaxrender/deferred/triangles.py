@@ -80,9 +80,12 @@ def project_triangles(
         valid &= right_way if two_sided is None else right_way | two_sided[clipped.source]
     if drawn is not None:
         valid &= drawn[clipped.source]
-    swap = lambda values: jnp.where(  # noqa: E731
-        front.reshape(-1, *(1,) * (values.ndim - 1)), values[:, jnp.array([0, 2, 1])], values
-    )
+
+    def swap(values: Array) -> Array:
+        turned = front.reshape(-1, *(1,) * (values.ndim - 2))
+        first, second, third = (values[:, k] for k in range(3))
+        return jnp.stack([first, jnp.where(turned, third, second), jnp.where(turned, second, third)], axis=1)
+
     return ScreenTriangles(
         xy=swap(xy), z=swap(z), w=swap(clipped.clip[..., 3]), weights=swap(clipped.weights), area=area,
         source=clipped.source, order=clipped.order, front=front, valid=valid,

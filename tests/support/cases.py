@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import legendre
 
+from tests.support import scenes
 from tests.support.tolerances import LONG_SUM, ROUNDING, TIGHT
 
 
@@ -54,8 +55,8 @@ class Case:
     """One call, made by keywords, and how far its two results may lie apart (units: see tolerances.py).
 
     `gradients` names the arrays, and the records of arrays, whose derivatives are compared, in float64: that shows
-    whether the formulas agree. Where an argument lives on a manifold (`on`: "sphere" for unit vectors and quaternions,
-    "rotation" for matrices) only the tangential part counts: formulas may differ off it.
+    whether the formulas agree. Where an argument or a field ("light.direction") lives on a manifold (`on`: "sphere" for
+    unit vectors and quaternions, "rotation" for matrices) only the tangential part counts: formulas may differ off it.
     """
 
     kernel: str
@@ -1016,11 +1017,246 @@ def _scene() -> list[Case]:
     ]
 
 
+# 1 - n·h² is held against α² in D, so each rounding of n·h counts 1/α² times there; α = roughness².
+def _ulps_of_facets(roughness: float) -> float:
+    return 8.0 / roughness**4
+
+
+def _brdf() -> list[Case]:
+    n = _unit(12)
+    wi, wo = (_unit(12) + 1.2 * n for _ in range(2))
+    wi, wo = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (wi, wo))
+    wi[2], wo[5] = -wi[2], -wo[5]  # below the horizon
+    vectors = {"wi": wi, "wo": wo, "n": n}
+    sphere = dict.fromkeys(vectors, "sphere")
+    mirror = 2.0 * np.sum(n * wo, axis=1, keepdims=True) * n - wo
+    near_peak = mirror + 0.01 * _normal(12, 3)
+    near_peak /= np.linalg.norm(near_peak, axis=1, keepdims=True)
+    cosines = {name: np.sum(a * b, axis=1) for name, a, b in (("n_i", n, wi), ("n_o", n, wo), ("i_o", wi, wo))}
+    base = {"base_color": _uniform(0, 1, 12, 3)}
+    rough = {"roughness": _uniform(0.4, 1.0, 12, 1)}
+    either = {"metallic": (np.arange(12) % 2.0)[:, None]}
+    exponent = _uniform(0.5, 60.0, 12)
+    facets = _ulps_of_facets(0.4)
+    function = "brdf.metallic_roughness"
+    return [
+        Case("brdf.lambert", {"albedo": _uniform(0, 1, 4, 3)}, gradients=("albedo",)),
+        Case(
+            "brdf.phong",
+            {**vectors, "specular": _uniform(0, 1, 12, 3), "exponent": exponent[:, None]},
+            gradients=(*vectors, "specular", "exponent"),
+            on=sphere,
+            ulps32=LONG_SUM,  # an exponent of 60
+        ),
+        Case("brdf.phong_lobe", {**cosines, "exponent": exponent}, gradients=(*cosines, "exponent"), ulps32=LONG_SUM),
+        Case(
+            "brdf.ggx",
+            {**cosines, "roughness": rough["roughness"][:, 0]},
+            gradients=(*cosines, "roughness"),
+            ulps32=facets,
+        ),
+        Case(
+            "brdf.ggx",
+            {**cosines, "roughness": rough["roughness"][:, 0], "sin2_h": _uniform(0, 1, 12)},
+            "half vector given",
+            gradients=(*cosines, "roughness", "sin2_h"),
+            ulps32=facets,
+        ),
+        Case(
+            function,
+            {**vectors, **base, **either, **rough},
+            "metals and dielectrics",
+            gradients=(*vectors, "base_color", "roughness"),
+            on=sphere,
+            ulps32=facets,
+        ),
+        Case(
+            function,
+            {**vectors, **base, **rough, "metallic": _uniform(0.2, 0.8, 12, 1)},
+            "half metals",
+            gradients=("metallic", "base_color"),
+            ulps32=facets,
+        ),
+        Case(
+            function,
+            {**vectors, "wi": near_peak, **base, **either, "roughness": np.full((12, 1), 0.1)},
+            "near the peak",
+            ulps64=_ulps_of_facets(0.1),
+            ulps32=_ulps_of_facets(0.1),
+        ),
+        Case(
+            function,
+            {**vectors, **base, "metallic": np.ones((12, 1)), "roughness": _uniform(0.0, 0.03, 12, 1)},
+            "mirrors off their peak",
+            entrywise=True,
+            ulps32=LONG_SUM,
+        ),
+    ]
+
+
+def _records(**records: dict[str, np.ndarray]) -> dict[str, Record]:
+    """Records of `tests.support.scenes` by the names of their arguments."""
+    names = {"material": "scene.Material", "lights": "scene.Lights", "textures": "deferred.texture.Textures"}
+    return {name: Record(names[name], fields) for name, fields in records.items()}
+
+
+def _scene_record() -> Record:
+    parts = _records(material=scenes.material(_rng), lights=scenes.lights())
+    extra = {"cameras": (), "name": "small"}
+    return Record("scene.Scene", {**scenes.scene(_rng), **parts, **extra})
+
+
+def _whole_scene() -> list[Case]:
+    scene = {"scene": _scene_record()}
+    return [
+        Case("scene.scene_bounds", scene, gradients=("scene",)),
+        Case("scene.whole_scene_camera", {**scene, "aspect": 1.7, "azimuth_radians": -1.0}, gradients=("scene",)),
+        Case("scene.inside_camera", {**scene, "fov_y_radians": 0.8}, gradients=("scene",)),
+    ]
+
+
+def _gbuffer_record(*shape: int) -> Record:
+    """Samples of the materials of `scenes.material` here and there, a few of them empty."""
+    ids = np.arange(math.prod(shape), dtype=np.int32).reshape(shape) % 6 - 1
+    normal = _unit(*shape) * [0.5, 0.5, 0.5] + [0.0, 1.0, 0.3]
+    bent = normal + 0.4 * _normal(*shape, 3)
+    some = (ids >= 0)[..., None]
+    fields = {
+        "position": _uniform(-1.0, 1.0, *shape, 3),
+        "normal": bent / np.linalg.norm(bent, axis=-1, keepdims=True),
+        "geometric_normal": normal / np.linalg.norm(normal, axis=-1, keepdims=True),
+        "uv": 1.5 * _normal(*shape, 2),
+        "duv_dx": 0.3 * _normal(*shape, 2),
+        "duv_dy": 0.1 * _normal(*shape, 2),
+        "color": _uniform(0.2, 1.0, *shape, 4),
+    }
+    fields = {name: np.where(some, values, 0.0) for name, values in fields.items()}
+    ids = {"material_id": np.minimum(ids, 3), "triangle_id": ids}
+    return Record("deferred.gbuffer.GBuffer", {**fields, "depth": np.where(some[..., 0], 2.0, 0.0), **ids})
+
+
+def _surface_record(*shape: int, metallic: np.ndarray) -> Record:
+    fields = {
+        "base_color": _uniform(0.1, 1.0, *shape, 3),
+        "alpha": _uniform(0.0, 1.0, *shape),
+        "metallic": metallic,
+        "roughness": _uniform(0.5, 1.0, *shape, 1),
+        "emissive": _uniform(0.0, 0.2, *shape, 3),
+        "occlusion": _uniform(0.0, 1.0, *shape, 1),
+    }
+    return Record("deferred.shade.Surface", fields)
+
+
+def _one_light(index: int, **changed: np.ndarray) -> Record:
+    """A light of `scenes.lights`, without its leading axis."""
+    fields = {name: np.array(values[index]) for name, values in scenes.lights().items()}
+    return Record("scene.Lights", fields | changed)
+
+
+def _deferred_shading() -> list[Case]:
+    room = "deferred.shade"
+    position = {"position": _uniform(-1.0, 1.0, 4, 3)}
+    kinds = {"sun": 0, "lamp with an end": 2, "spot": 3}
+    finite = {"range": np.array(7.0)}
+    # Lights that end far away: the slope in a range of inf is tests/deferred/test_shading_gradients.py's.
+    lights = scenes.lights()
+    lights["range"] = np.minimum(lights["range"], 50.0)
+    shape = 2, 12
+    gbuffer = {"gbuffer": _gbuffer_record(*shape)}
+    either = np.arange(24.0).reshape(*shape, 1) % 2.0
+    shaded = {
+        **gbuffer,
+        "surface": _surface_record(*shape, metallic=either),
+        **_records(lights=lights),
+        "eye": np.array([0.2, 1.5, 2.5]),
+    }
+    around = {order: {"ambient": 0.3 * _normal(3, order**2) + np.eye(1, order**2)} for order in (1, 3, 5)}
+    vectors = {"gbuffer.normal": "sphere", "gbuffer.geometric_normal": "sphere", "lights.direction": "sphere"}
+    facets = 5.0 * _ulps_of_facets(0.5)  # five lights
+    looked_up = {
+        "gbuffer": _gbuffer_record(9),
+        **_records(material=scenes.material(_rng), textures=scenes.textures(_rng)),
+    }
+    return [
+        *(
+            Case(
+                f"{room}.incoming",
+                {"light": _one_light(index, **finite), **position},
+                label,
+                gradients=("light", "position"),
+                on={"light.direction": "sphere"},
+            )
+            for label, index in kinds.items()
+        ),
+        Case(f"{room}.incoming", {"light": _one_light(1), **position}, "lamp without end", gradients=("position",)),
+        Case(
+            f"{room}.incoming",
+            {
+                "light": _one_light(
+                    3,
+                    position=np.array([0.0, 1.0, 0.0]),
+                    direction=np.array([0.0, -1.0, 0.0]),
+                    cos_inner=np.array(0.8002),
+                    cos_outer=np.array(0.8),
+                ),
+                "position": np.array([[math.sqrt(1.0 - c**2) / c, 0.0, 0.0] for c in (0.79, 0.8001, 0.8004, 0.802)]),
+            },
+            "narrow cone",
+            ulps32=2048.0,  # a cosine near 1 against a cone of 10⁻³
+        ),
+        *(
+            Case(
+                f"{room}.shade",
+                {**shaded, **more, "model": model},
+                f"{model}, ambient {len(more)}",
+                gradients=free,
+                on=vectors,
+                ulps32=facets,
+            )
+            for model, more, free in (
+                ("metallic_roughness", {}, ()),
+                ("metallic_roughness", around[3], ()),
+                ("phong", around[5], ("gbuffer", "surface", "lights", "eye", "ambient")),
+                ("lambert", around[1], ()),
+            )
+        ),
+        Case(
+            f"{room}.shade",
+            {**shaded, "surface": _surface_record(*shape, metallic=_uniform(0.2, 0.8, *shape, 1))},
+            "half metals",
+            gradients=("surface",),
+            ulps32=facets,
+        ),
+        Case(f"{room}.look_up_surface", {**looked_up, "max_anisotropy": 3}, "all textures", ulps32=LONG_SUM),
+        Case(
+            f"{room}.look_up_surface",
+            {**looked_up, "max_anisotropy": 3, "slots": ("base_color_texture",)},
+            "one texture",
+            gradients=("gbuffer", "material", "textures"),
+            ulps32=LONG_SUM,
+        ),
+        Case(f"{room}.look_up_surface", {**looked_up, "textures": None}, "no textures", gradients=("material",)),
+    ]
+
+
+def _late() -> list[Case]:
+    return [
+        Case(
+            "deferred.late.alpha_to_coverage",
+            {"alpha": np.concatenate([_uniform(0, 1, 4 * 5 * count - 2), [0.0, 1.0]]),
+             "place": _rng.permutation(4 * 5 * count).astype(np.int32), "num_samples": count, "width": 5},
+            f"{count} samples",
+        )
+        for count in (1, 2, 4, 8, 9, 16)
+    ]  # fmt: skip
+
+
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
         _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility,
-        _pose_model, _skeleton, _skinning, _camera, _metrics, _scene, _texture, _quads, _warps,
+        _pose_model, _skeleton, _skinning, _camera, _metrics, _scene, _texture, _quads, _warps, _brdf,
+        _whole_scene, _deferred_shading, _late,
     )
     for case in room()
 )  # fmt: skip

@@ -1,6 +1,7 @@
 """Calls a case in both packages: the border between the twins."""
 
 import contextlib
+import functools
 import importlib
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -39,11 +40,11 @@ def run_jax(case: Case, dtype: Any) -> tuple[Any, dict[str, np.ndarray]]:
             return sum(parts), result
 
         free = {name: arrays.pop(name) for name in _differentiated(case, dtype)}
-        whole = jax.grad(objective, has_aux=True) if free else (lambda a, b: ({}, objective(a, b)[1]))
+        whole = jax.grad(objective, has_aux=True, allow_int=True) if free else (lambda a, b: ({}, objective(a, b)[1]))
         # Compiling is nearly all of the time here, and twins are about formulas: no need to optimise.
         compiled = jax.jit(whole, compiler_options={"xla_backend_optimization_level": 0})
         slopes, result = jax.block_until_ready(compiled(free, arrays))
-        pairs = [pair for name, slope in slopes.items() for pair in flatten(slope, name)]
+        pairs = [pair for name, slope in slopes.items() for pair in flatten(slope, name) if _is_floating(pair[1])]
         return result, {name: _tangential(case, name, np.asarray(g)) for name, g in pairs}
 
 
@@ -51,14 +52,14 @@ def run_torch(case: Case, dtype: Any) -> tuple[Any, dict[str, np.ndarray]]:
     """The same of the twin."""
     with _default_dtype(dtype):
         arrays, rest = _arguments(case, "torchref", lambda x: torch.tensor(_rounded(x, dtype)))
-        named = [pair for name in _differentiated(case, dtype) for pair in flatten(arrays[name], name)]
+        pairs = [pair for name in _differentiated(case, dtype) for pair in flatten(arrays[name], name)]
+        named = [pair for pair in pairs if _is_floating(pair[1])]
         free = [x.requires_grad_() for _, x in named]
         result = case.outcome(public("torchref", case.kernel)(**arrays, **rest))
         outputs = [x for x in _arrays(result) if x.is_floating_point()]
         parts = [(x * torch.tensor(w, dtype=x.dtype)).sum() for x, w in zip(outputs, _mix(outputs), strict=True)]
         slopes = torch.autograd.grad(sum(parts), free, materialize_grads=True) if free else []
-        pairs = zip(named, slopes, strict=True)
-        return result, {name: _tangential(case, name, g.numpy()) for (name, _), g in pairs}
+        return result, {name: _tangential(case, name, g.numpy()) for (name, _), g in zip(named, slopes, strict=True)}
 
 
 def run_host(case: Case) -> tuple[Any, Any]:
@@ -71,6 +72,11 @@ def run_host(case: Case) -> tuple[Any, Any]:
 def _differentiated(case: Case, dtype: Any) -> tuple[str, ...]:
     """Names in the order in which JAX hands back a dictionary; none in float32."""
     return tuple(sorted(case.gradients)) if dtype == np.float64 else ()
+
+
+def _is_floating(leaf: Any) -> bool:
+    """Whether a leaf of a record has a derivative: ids, masks and names have none."""
+    return str(getattr(leaf, "dtype", "")).removeprefix("torch.").startswith("float")
 
 
 def _arrays(result: Any) -> list:
@@ -113,7 +119,9 @@ def _tangential(case: Case, name: str, slope: np.ndarray) -> np.ndarray:
     """The part of a derivative along the manifold on which the argument lives."""
     if name not in case.on:
         return slope
-    at = case.arguments[name].astype(slope.dtype)
+    argument, *path = name.split(".")
+    at = functools.reduce(lambda record, field: record.fields[field], path, case.arguments[argument])
+    at = at.astype(slope.dtype)
     if case.on[name] == "sphere":
         return slope - (slope * at).sum(-1, keepdims=True) * at
     return (slope - at @ slope.swapaxes(-1, -2) @ at) / 2.0

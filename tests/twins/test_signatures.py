@@ -17,8 +17,9 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 # What of jaxrender has a partner in torchref: whole rooms, and single modules. The rest of `animation` builds
 # the data of the built-in body.
 PAIRED = (
-    "vecmath", "camera", "metrics", "scene", "harmonics.", "animation.skeleton", "animation.skinning",
-    "deferred.samples", "deferred.texture", "deferred.quads", "deferred.warps",
+    "vecmath", "camera", "metrics", "scene", "brdf", "harmonics.", "animation.skeleton", "animation.skinning",
+    "deferred.samples", "deferred.texture", "deferred.quads", "deferred.warps", "deferred.gbuffer", "deferred.shade",
+    "deferred.late",
 )  # fmt: skip
 UNPAIRED_MODULES = {"harmonics.pipeline": "the order of the stages, no arithmetic"}
 
@@ -34,17 +35,17 @@ EXCEPTIONS = {
     "harmonics.pose_model.model_arrays": "jaxrender writes and checks files; the twin only loads",
     "harmonics.pose_model.read_model_file": "the same",
     "harmonics.pose_model.model_hash": "the same",
-    "scene.Material": "what files are read into; torchref reads none",
-    "scene.Lights": "the same",
-    "scene.SceneImage": "the same",
-    "scene.Scene": "the same",
-    "scene.scene_bounds": "of such a record",
-    "scene.whole_scene_camera": "the same",
     "deferred.quads.Quads": "of jaxrender's screen triangles, which the twin's Fragments do not hold",
     "deferred.quads.quad_coverage": "the same; judged by brute force in tests/deferred",
     "deferred.quads.visible_quads": "the same",
     "deferred.quads.visible_masks": "the same",
     "deferred.quads.draw_overdraw": "a picture for people",
+    "deferred.gbuffer.AttributeTable": "jaxrender's own way: what it gathers by sample, in rows",
+    "deferred.gbuffer.attribute_table": "the same",
+    "deferred.gbuffer.plane_slopes": "the same; the twin solves for the weights",
+    "deferred.gbuffer.gbuffer_rows": "jaxrender's own way: bands of an image",
+    "deferred.gbuffer.surface_points": "the same, for lists of fragments",
+    "deferred.late.draw_late": "a driver: finds fragments and calls the shader; judged in tests/deferred",
     "harmonics.sh.triple_product_tensor": "torchref's way to the product",
     "harmonics.zh.zonal_integral": "torchref integrates where jaxrender has closed forms",
 }
@@ -56,6 +57,8 @@ COMPARED_APART = {
     "harmonics.pose_model.load_pose_model": "reads a file",
     "deferred.samples.ordered_grid": "field by field in tests/twins/test_raster.py",
     "deferred.samples.standard_pattern": "the same",
+    "deferred.gbuffer.make_gbuffer": "on fragments that both sides share: tests/twins/test_shading.py",
+    "deferred.late.resolve": "the same",
     "deferred.quads.quad_derivatives": "on fragments that each side rasterises: tests/twins/test_quads.py",
 }
 

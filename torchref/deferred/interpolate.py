@@ -56,16 +56,26 @@ def weights_at(
     """
     h, w, _ = fragments.triangle_id.shape
     m = fragments.samples.grid
+    x, y = x.to(torch.float64), y.to(torch.float64)
+    place = torch.stack([x / (w * m * 128), -y / (h * m * 128), torch.ones_like(x)], dim=-1)
+    solved = torch.linalg.solve(corner_matrix(fragments), place[..., None])[..., 0]
+    return _as_mode(fragments, (solved / solved.sum(-1, keepdim=True)).to(fragments.barycentrics.dtype), mode)
+
+
+def corner_matrix(fragments: Fragments) -> Float[Tensor, "h w s 3 3"]:
+    """The corners (x, y, w) of each sample's triangle in clip space as columns, in float64; 1 where it is empty.
+
+    A triangle in front of the eye has its corners where they snap to on the screen.
+    """
+    h, w, _ = fragments.triangle_id.shape
+    m = fragments.samples.grid
     half = torch.tensor([w * m * 128.0, -h * m * 128.0], dtype=torch.float64)
     corners = fragments.clip[fragments.faces[fragments.triangle_id.clamp(min=0)]].to(torch.float64)
     own_w = corners[..., 3:]
     snapped = torch.round((corners[..., :2].float() / own_w.float()) * half.float()).to(torch.float64) / half * own_w
     xy = torch.where((own_w > 0).all(dim=-2, keepdim=True), snapped, corners[..., :2])
-    place = torch.stack([x / half[0], y / half[1], torch.ones_like(x / half[0])], dim=-1)
     matrix = torch.cat([xy, own_w], dim=-1).transpose(-1, -2)
-    safe = torch.where(fragments.coverage[..., None, None], matrix, torch.eye(3, dtype=torch.float64))
-    solved = torch.linalg.solve(safe, place[..., None])[..., 0]
-    return _as_mode(fragments, (solved / solved.sum(-1, keepdim=True)).to(fragments.barycentrics.dtype), mode)
+    return torch.where(fragments.coverage[..., None, None], matrix, torch.eye(3, dtype=torch.float64))
 
 
 def interpolate_at_offset(
