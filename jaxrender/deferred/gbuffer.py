@@ -21,6 +21,9 @@ from jaxrender.vecmath import normalize, safe_div
 #: Samples that are interpolated at a time; what they gather stays in a processor's cache.
 SAMPLES_PER_BAND = 1 << 15
 
+#: What `surface_points` wants to know of a sample: fields of `Fragments`.
+POINT_FIELDS = ("triangle_id", "screen_id", "barycentrics", "w")
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -162,26 +165,20 @@ def gbuffer_rows(
     Args:
       table: of `attribute_table`.
     """
-    names = ("triangle_id", "screen_id", "barycentrics", "depth", "w")
-    rows = {name: jax.lax.dynamic_slice_in_dim(getattr(fragments, name), start, num_rows) for name in names}
-    gbuffer, previous = surface_points(
-        scene, table, rows["triangle_id"], rows["screen_id"], rows["barycentrics"], rows["w"], textures=textures,
-        max_anisotropy=max_anisotropy,
-    )  # fmt: skip
-    if not previous.shape[-1]:
-        return gbuffer
-    return dataclasses.replace(gbuffer, motion=_motion(fragments, previous, start))
+    rows = {name: jax.lax.dynamic_slice_in_dim(getattr(fragments, name), start, num_rows) for name in POINT_FIELDS}
+    gbuffer, previous = surface_points(scene, table, **rows, textures=textures, max_anisotropy=max_anisotropy)
+    return with_motion(gbuffer, fragments, previous, start)
 
 
 def surface_points(
     scene: Scene, table: AttributeTable, triangle_id: Int[Array, "*b"], screen_id: Int[Array, "*b"],
     barycentrics: Float[Array, "*b 2"], w: Float[Array, "*b"], *, textures: Textures | None = None,
     max_anisotropy: int = 8,
-) -> tuple[GBuffer, Float[Array, "*b p"]]:  # fmt: skip
+) -> tuple[GBuffer, Float[Array, "*b 4"] | None]:  # fmt: skip
     """Points on triangles, in any order: the fields of `Fragments` or of `late.FragmentList` -> those of `GBuffer`.
 
     Returns:
-      the surface there, with any leading axes, and the previous clip position (p = 4, or 0 if the table has none).
+      the surface there, with any leading axes, and the previous clip position, if the table has them.
     """
     b1, b2 = barycentrics[..., :1], barycentrics[..., 1:]
     some, own, screen = (triangle_id >= 0)[..., None], jnp.maximum(triangle_id, 0), jnp.maximum(screen_id, 0)
@@ -208,11 +205,15 @@ def surface_points(
         position=position, normal=normal * side, geometric_normal=table.flat[own] * side, uv=uv, duv_dx=duv_dx,
         duv_dy=duv_dy, color=color, depth=w, material_id=material_id, triangle_id=triangle_id,
     )  # fmt: skip
-    return gbuffer, previous
+    return gbuffer, previous if previous.shape[-1] else None
 
 
-def _motion(fragments: Fragments, previous: Float[Array, "r w s 4"], start: Int[Array, ""] | int):
-    """From interpolated previous clip positions: this place less that place, in pixels."""
+def with_motion(
+    gbuffer: GBuffer, fragments: Fragments, previous: Float[Array, "r w s 4"] | None, start: Int[Array, ""] | int
+) -> GBuffer:
+    """Rows from `start` on with `GBuffer.motion`, if there are previous clip positions."""
+    if previous is None:
+        return gbuffer
     h, w, _ = fragments.triangle_id.shape
     check_last_axis("previous_clip", previous, 4)
     unit = SUBPIXELS * fragments.samples.grid
@@ -223,7 +224,7 @@ def _motion(fragments: Fragments, previous: Float[Array, "r w s 4"], start: Int[
     seen = previous[..., 3] > 0.0
     over_w = 1.0 / jnp.where(seen, previous[..., 3], 1.0)
     moved = jnp.stack([x - 0.5 * w * previous[..., 0] * over_w, y + 0.5 * h * previous[..., 1] * over_w], axis=-1)
-    return jnp.where(seen[..., None], moved, 0.0)
+    return dataclasses.replace(gbuffer, motion=jnp.where(seen[..., None], moved, 0.0))
 
 
 def _with_normal_map(

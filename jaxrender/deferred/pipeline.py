@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +13,14 @@ from jaxrender.camera import Camera, clip_from_world, depth_range
 from jaxrender.checks import check_one_of
 from jaxrender.deferred.bands import band_starts, in_bands
 from jaxrender.deferred.gbuffer import (
+    POINT_FIELDS,
     SAMPLES_PER_BAND,
     AttributeTable,
     GBuffer,
     attribute_table,
     gbuffer_rows,
     surface_points,
+    with_motion,
 )
 from jaxrender.deferred.late import FragmentList, alpha_to_coverage, draw_late
 from jaxrender.deferred.raster import Fragments, rasterize_triangles, screen_triangles
@@ -28,6 +31,9 @@ from jaxrender.scene import DIRECTIONAL, MASK, OPAQUE, Lights, Scene, scene_boun
 from jaxrender.vecmath import matmul, normalize
 
 TRANSPARENCY = ("test", "coverage", "none")
+
+#: Samples that are shaded at a time.
+SAMPLES_PER_BLOCK = 1024
 
 
 def scene_textures(scene: Scene) -> Textures | None:
@@ -176,7 +182,9 @@ def render_scene(
     slots = tuple(
         slot for slot in (*TEXTURE_SLOTS, "normal_texture") if bool((getattr(scene.material, slot) >= 0).any())
     )
-    band = min(max(1, SAMPLES_PER_BAND // (width * samples.count)), height)
+    band = min(
+        max(1, SAMPLES_PER_BAND // (width * samples.count), round((SAMPLES_PER_BLOCK / samples.count) ** 0.5)), height
+    )
     rows = functools.partial(
         _shaded_rows, scene, table, fragments, textures, lights, ambient, camera.eye, num_rows=band,
         max_anisotropy=max_anisotropy, slots=slots, model=model,
@@ -191,15 +199,36 @@ def render_scene(
 def _shaded_rows(
     scene, table, fragments, textures, lights, ambient, eye, start, *, num_rows, max_anisotropy, slots, model
 ):
-    gbuffer = gbuffer_rows(
-        scene, table, fragments, start, num_rows=num_rows, max_anisotropy=max_anisotropy,
-        textures=textures if "normal_texture" in slots else None,
-    )  # fmt: skip
-    surface = look_up_surface(gbuffer, scene.material, textures, max_anisotropy=max_anisotropy, slots=slots)
-    radiance = shade(gbuffer, surface, lights, eye, ambient=ambient, model=model)
-    share = jnp.mean(gbuffer.coverage.astype(jnp.float32), axis=-1)
-    mean = jnp.sum(radiance, axis=-2) / jnp.maximum(share[..., None] * radiance.shape[-2], 1.0)
-    return gbuffer, surface, mean, share
+    """G-buffer, surface, mean radiance and coverage of some rows, block by block.
+
+    A block is small and square, so that its footprints are alike: a lookup costs as much as its widest one.
+    """
+    rows = {name: jax.lax.dynamic_slice_in_dim(getattr(fragments, name), start, num_rows) for name in POINT_FIELDS}
+    _, width, num_samples = rows["triangle_id"].shape
+    columns = max(1, min(width, SAMPLES_PER_BLOCK // (num_rows * num_samples)))
+
+    def block(own: dict[str, Array]) -> tuple:
+        gbuffer, previous = surface_points(
+            scene, table, **own, max_anisotropy=max_anisotropy,
+            textures=textures if "normal_texture" in slots else None,
+        )  # fmt: skip
+        surface = look_up_surface(gbuffer, scene.material, textures, max_anisotropy=max_anisotropy, slots=slots)
+        radiance = shade(gbuffer, surface, lights, eye, ambient=ambient, model=model)
+        share = jnp.mean(gbuffer.coverage.astype(jnp.float32), axis=-1)
+        mean = jnp.sum(radiance, axis=-2) / jnp.maximum(share[..., None] * num_samples, 1.0)
+        return gbuffer, previous, surface, mean, share
+
+    def cut(values: Array) -> Array:
+        empty = [(0, 0), (0, -width % columns), *((0, 0) for _ in values.shape[2:])]
+        whole = jnp.pad(values, empty, constant_values=-1 if values.dtype == jnp.int32 else 0)
+        return whole.reshape(num_rows, -1, columns, *values.shape[2:]).swapaxes(0, 1)
+
+    def join(values: Array) -> Array:
+        return values.swapaxes(0, 1).reshape(num_rows, -1, *values.shape[3:])[:, :width]
+
+    shaded = jax.lax.map(block, jax.tree.map(cut, rows))
+    gbuffer, previous, surface, mean, share = jax.tree.map(join, shaded)
+    return with_motion(gbuffer, fragments, previous, start), surface, mean, share
 
 
 def draw_gbuffer(
