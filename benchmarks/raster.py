@@ -23,8 +23,9 @@ from benchmarks import llvmpipe
 from benchmarks.suites import Measurement, Options
 from benchmarks.timing import measure, measure_alternating
 from jaxrender import console
-from jaxrender.camera import Camera, clip_from_world, depth_range
+from jaxrender.camera import Camera, clip_from_world
 from jaxrender.deferred import (
+    clip_positions,
     draw_gbuffer,
     look_up_surface,
     make_gbuffer,
@@ -38,6 +39,7 @@ from jaxrender.io import load_scene
 from jaxrender.io.builtin_scene import builtin_scene
 from jaxrender.machine import keep_xla_to_one_thread
 from jaxrender.scene import POINT, Lights, Scene, scene_bounds, whole_scene_camera
+from jaxrender.vecmath import matmul
 
 SPONZA = Path(__file__).resolve().parents[2] / "shared" / "data" / "sponza" / "Sponza.gltf"
 SIZES, QUICK_SIZES = ((768, 1024), (3072, 4096)), ((192, 256),)
@@ -54,7 +56,7 @@ def run(options: Options) -> Iterator[Measurement]:
     """The cases in the order of the stages."""
     keep_xla_to_one_thread()
     sizes = QUICK_SIZES if options.quick else SIZES
-    if any(options.wants(case) for case in ("ids", "gbuffer", "shaded")):
+    if any(options.wants(case) for case in ("ids", "gbuffer", "shaded", "lights")):
         scene, camera, name = _scene()
         for height, width in sizes:
             yield from _of_scene(scene, camera, name, height, width, options)
@@ -73,9 +75,7 @@ def _scene() -> tuple[Scene, Camera, str]:
 
 
 def _of_scene(scene, camera, name: str, height: int, width: int, options: Options) -> Iterator[Measurement]:
-    near, far = depth_range(camera, *scene_bounds(scene))
-    matrix = clip_from_world(camera, height=height, width=width, near=near, far=far)
-    clip = jnp.concatenate([scene.positions, jnp.ones_like(scene.positions[:, :1])], axis=1) @ matrix.T
+    clip = clip_positions(scene, camera, height=height, width=width)
     params: Params = {"scene": name, "height": height, "width": width, "triangles": len(scene.faces), "cull": "back"}
     ids = lambda: rasterize(clip, scene.faces, height=height, width=width, cull="back")  # noqa: E731
     if options.wants("ids"):
@@ -144,7 +144,7 @@ def _million(height: int, width: int, options: Options) -> Iterator[Measurement]
     eye, target, up = (jnp.asarray(v, jnp.float32) for v in ([0.0, 9.0, 6.0], [0.0, 0.0, -40.0], [0.0, 1.0, 0.0]))
     camera = Camera(eye, target, up, jnp.float32(np.radians(50.0)))
     matrix = clip_from_world(camera, height=height, width=width, near=jnp.float32(1.0), far=jnp.float32(200.0))
-    clip = jnp.pad(points, ((0, 0), (0, 1)), constant_values=1.0) @ matrix.T
+    clip = matmul(jnp.pad(points, ((0, 0), (0, 1)), constant_values=1.0), matrix.T)
     params: Params = {"height": height, "width": width, "triangles": len(faces), "cull": "back"}
     ids = lambda: rasterize(clip, faces, height=height, width=width, cull="back")  # noqa: E731
     yield from _beside("million", ids, _peer(clip, faces, height, width, body="", num_targets=0), params)

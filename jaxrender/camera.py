@@ -45,7 +45,7 @@ def look_at(eye: Float[Array, "3"], target: Float[Array, "3"], up: Float[Array, 
 def view_from_world(camera: Camera) -> Float[Array, "4 4"]:
     """The rigid transform of homogeneous points from world to view space."""
     rotation = look_at(camera.eye, camera.target, camera.up).T
-    affine = jnp.concatenate([rotation, -(rotation @ camera.eye)[:, None]], axis=1)
+    affine = jnp.concatenate([rotation, -vecmath.matmul(rotation, camera.eye)[:, None]], axis=1)
     return jnp.concatenate([affine, jnp.asarray([[0.0, 0.0, 0.0, 1.0]], affine.dtype)], axis=0)
 
 
@@ -71,7 +71,7 @@ def camera_rays(
     step = 2.0 * jnp.tan(0.5 * camera.fov_y_radians) / height
     x, y = (px[..., 0] - 0.5 * width) * step, (0.5 * height - px[..., 1]) * step
     view = vecmath.normalize(jnp.stack([x, y, -jnp.ones_like(x)], axis=-1))
-    directions = view @ look_at(camera.eye, camera.target, camera.up).T
+    directions = vecmath.matmul(view, look_at(camera.eye, camera.target, camera.up).T)
     return jnp.broadcast_to(camera.eye, directions.shape), directions
 
 
@@ -135,7 +135,7 @@ def project_px(
     A point in the plane of the eye (depth 0) lands at (width / 2, height / 2).
     """
     world_from_view = look_at(camera.eye, camera.target, camera.up)
-    view = (points - jnp.broadcast_to(camera.eye, points.shape)) @ world_from_view
+    view = vecmath.matmul(points - jnp.broadcast_to(camera.eye, points.shape), world_from_view)
     depth = -view[..., 2]
     step = 2.0 * jnp.tan(0.5 * camera.fov_y_radians) / height
     x = vecmath.safe_div(view[..., 0], depth * step) + 0.5 * width
@@ -189,7 +189,7 @@ def frame_bounds(
     )
     center, half = 0.5 * (minimum + maximum), 0.5 * (1.0 + margin) * (maximum - minimum)
     corners = jnp.asarray(_BOX_CORNERS, dtype) * jnp.broadcast_to(half, (8, 3))
-    x, y, z = (corners @ look_at(backward, jnp.zeros_like(backward), up)).T
+    x, y, z = vecmath.matmul(corners, look_at(backward, jnp.zeros_like(backward), up)).T
     tangent = math.tan(0.5 * fov_y_radians)
     distance = jnp.max(z + jnp.maximum(jnp.abs(x) / (tangent * aspect), jnp.abs(y) / tangent))
     # A box without extent is seen from one unit away.

@@ -104,6 +104,10 @@ class SceneView:
     """Vertical field of view, with --eye or --inside."""
 
     def __post_init__(self):
+        if self.eye is not None and (self.inside or not all(map(math.isfinite, (*self.eye, *self.target)))):
+            raise ValueError("--eye, --target: expected finite numbers, and not --inside as well")
+        if self.eye is not None and self.eye == self.target:
+            raise ValueError("--target: expected another point than --eye")
         if min(self.size) < 1:
             raise ValueError(f"--size: expected two numbers of 1 or more, got {self.size[0]} {self.size[1]}")
         check_one_of("--samples", self.samples, (1, 2, 4, 8, 16))

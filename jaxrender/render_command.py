@@ -30,6 +30,8 @@ BACKDROP_TOP, BACKDROP_BOTTOM = (0.32, 0.4, 0.5), (0.16, 0.17, 0.18)
 
 def run_render(options: "Render") -> None:
     """The command."""
+    if options.out.suffix not in ("", ".png"):
+        bad_input("-o", str(options.out), expected="a name ending in .png", got=options.out.suffix)
     out = options.out.with_suffix(".png")
     if not is_writable_folder(out.parent):
         bad_input("-o", str(out.parent), expected="a folder that can be written", got="one that cannot")
@@ -46,6 +48,8 @@ def run_render(options: "Render") -> None:
         textures=scene_textures(scene), transparency=options.transparency, model=options.model, **light,
     )  # fmt: skip
     seconds = time.perf_counter() - started
+    if not rendering.alpha.any():
+        console.announce(f"{scene.name}: nothing of it is seen")
     paths = [out]
     if environment is None:
         behind = gradient_background(height, width, top=BACKDROP_TOP, bottom=BACKDROP_BOTTOM)
@@ -76,10 +80,10 @@ def choose_camera(scene: Scene, options: "SceneView") -> Camera:
         return Camera(eye, target, jnp.asarray(up, jnp.float32), jnp.float32(math.radians(options.fov_degrees)))
     if options.inside:
         return inside_camera(scene, fov_y_radians=math.radians(options.fov_degrees))
-    if not scene.cameras:
+    if not scene.cameras and options.camera == 0:
         return whole_scene_camera(scene, aspect=options.size[0] / options.size[1])
     if options.camera >= len(scene.cameras):
-        bad_input("--camera", scene.name, expected=f"0 to {len(scene.cameras) - 1}", got=options.camera)
+        bad_input("--camera", scene.name, expected=f"one of {len(scene.cameras)} cameras", got=options.camera)
     return scene.cameras[options.camera]
 
 

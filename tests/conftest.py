@@ -43,3 +43,10 @@ def dtype(request) -> Iterator[np.dtype]:
     """The test runs in either precision."""
     with jax.enable_x64(request.param == "float64"):
         yield np.dtype(request.param)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forget_programs() -> Iterator[None]:
+    """Thousands of compiled programs in one process come to the limit of its memory maps, and XLA crashes there."""
+    yield
+    jax.clear_caches()

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import lineax
 import numpy as np
 import optimistix
 from jax.scipy.spatial.transform import Rotation
@@ -96,7 +97,9 @@ def refine(unknown: Unknown, fragments: Fragments, target, seen, prior, weight) 
         image = jnp.where(seen[..., None], draw(guess, fragments) - target, 0.0)
         return image, weight * (guess.texture - prior)
 
-    solver = optimistix.LevenbergMarquardt(rtol=1e-4, atol=1e-5)
+    # Conjugate gradients on the normal equations: hundreds of texels need no dense matrix.
+    linear = lineax.Normal(lineax.CG(rtol=1e-5, atol=1e-7, max_steps=500))
+    solver = optimistix.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=linear)
     return optimistix.least_squares(residuals, solver, unknown, max_steps=3, throw=False).value
 
 
@@ -106,7 +109,7 @@ def recover(target: jax.Array, covered: jax.Array, start: Unknown, *, rounds: in
     for k in range(rounds):
         fragments = see(unknown)
         seen = covered & fragments.coverage[:, :, 0]
-        unknown = refine(unknown, fragments, target, seen, start.texture, jnp.float32(0.5 * 0.6**k))
+        unknown = refine(unknown, fragments, target, seen, start.texture, jnp.float32(0.5 * 0.45**k))
     return unknown
 
 

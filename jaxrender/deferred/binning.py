@@ -158,6 +158,13 @@ def tile_lists(tile: Int[Array, " p"], *, num_tiles: int) -> TileLists:
     return TileLists(start=jnp.cumsum(count) - count, count=count)
 
 
+def total(counts: Int[Array, " n"]) -> Int[Array, ""]:
+    """The sum, or the greatest int32 where it is larger than that."""
+    most = np.iinfo(np.int32).max
+    roughly = jnp.sum(counts.astype(jnp.float32))
+    return jnp.where(roughly < 0.99 * most, jnp.sum(counts, dtype=jnp.int32), most)
+
+
 def _expand(counts: Int[Array, " n"], size: int):
     """`counts[i]` entries for each i: which i, the number within it, and whether the entry is used."""
     ends = jnp.cumsum(counts)

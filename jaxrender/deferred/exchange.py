@@ -8,13 +8,14 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Num
+from jaxtyping import Array, Float, Num
 
-from jaxrender.camera import Camera
-from jaxrender.checks import bad_input
+from jaxrender.camera import Camera, camera_rays
+from jaxrender.checks import bad_input, check_one_of
 from jaxrender.deferred.gbuffer import GBuffer
 from jaxrender.deferred.packing import positions_from_depth
 from jaxrender.deferred.texture import texture_derivatives
+from jaxrender.vecmath import dot, normalize
 
 #: Depths from here on mean that nothing is there: Blender writes 1e10, others infinity.
 FAR_AWAY = 1e9
@@ -33,7 +34,8 @@ def gbuffer_layers(gbuffer: GBuffer, *, sample: int | None = None) -> dict[str, 
     Ids are counted from 1, as unsigned numbers: 0 is nothing.
 
     Args:
-      sample: whose values; by default means over the covered samples, and the ids of the first sample.
+      sample: whose values; by default means over the covered samples (unit vectors again), and the ids of the first
+        covered sample.
     """
     covered = np.asarray(gbuffer.coverage)
     chosen = covered if sample is None else covered[:, :, sample : sample + 1]
@@ -45,15 +47,23 @@ def gbuffer_layers(gbuffer: GBuffer, *, sample: int | None = None) -> dict[str, 
         return np.sum(values * chosen[..., None], axis=2) / np.maximum(chosen.sum(axis=-1, keepdims=True), 1)
 
     layers = {name: layer(getattr(gbuffer, f)) for name, f in _FIELDS.items() if getattr(gbuffer, f) is not None}
+    for name in ("normal", "geometric_normal"):
+        length = np.linalg.norm(layers[name], axis=-1, keepdims=True)
+        layers[name] = layers[name] / np.where(length > 0.0, length, 1.0)
     layers["vertexcolor"] = layer(gbuffer.color)
+    first = np.argmax(covered, axis=-1)[..., None] if sample is None else np.full((*covered.shape[:2], 1), sample)
     for name, field in _IDS.items():
-        ids = np.asarray(getattr(gbuffer, field))[:, :, sample or 0, None]
+        ids = np.take_along_axis(np.asarray(getattr(gbuffer, field)), first, axis=2)
         layers[name] = (ids + 1).astype(np.uint32)
     return layers
 
 
 def gbuffer_from_layers(
-    layers: Mapping[str, Num[np.ndarray, "h w c"]], *, camera: Camera | None = None, name: str = "layers"
+    layers: Mapping[str, Num[np.ndarray, "h w c"]],
+    *,
+    camera: Camera | None = None,
+    depth_kind: str = "planar",
+    name: str = "layers",
 ) -> GBuffer:
     """A G-buffer of one sample a pixel from layers of any renderer.
 
@@ -66,10 +76,13 @@ def gbuffer_from_layers(
     Args:
       layers: of `io.known_layers`.
       camera: of the picture; needed unless there are both position and depth.
+      depth_kind: "planar", along the camera's axis, as Blender, Arnold and this library have it; or "distance" along
+        the ray, as Mitsuba has it (needs the camera).
       name: of the file, for messages.
     Raises:
       InputError: if there is no normal, or neither depth nor position, or a camera is missing.
     """
+    check_one_of("depth_kind", depth_kind, ("planar", "distance"))
     if "normal" not in layers and "geometric_normal" in layers:
         layers = {**layers, "normal": layers["geometric_normal"]}
     if "normal" not in layers or not {"depth", "position"} & set(layers):
@@ -83,6 +96,8 @@ def gbuffer_from_layers(
     zeros = np.zeros((height, width, 2))
     if "depth" in layers:
         depth = field(_finite(layers["depth"]))[..., 0]
+        if depth_kind == "distance":
+            depth = depth * _axis_share(camera, height, width, name)
     else:
         assert camera is not None
         ahead = np.asarray(camera.target - camera.eye, np.float64)
@@ -109,6 +124,14 @@ def gbuffer_from_layers(
         motion=field(_finite(layers["motion"])) if "motion" in layers else None,
         **ids,
     )
+
+
+def _axis_share(camera: Camera | None, height: int, width: int, name: str) -> Float[Array, "h w 1"]:
+    """Depth along the axis of a point one unit away, for each pixel."""
+    if camera is None:
+        bad_input(name, "camera", expected="the camera of a depth along rays", got="none")
+    _, directions = camera_rays(camera, height=height, width=width)
+    return dot(directions, normalize(camera.target - camera.eye).reshape(1, 1, 3))
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

@@ -130,6 +130,8 @@ def make_gbuffer(
     grid = fragments.samples.grid
     table = attribute_table(scene, fragments.triangles, grid=grid, previous_clip=previous_clip)
     h, w, s = fragments.triangle_id.shape
+    if not fragments.triangle_id.size:
+        return gbuffer_rows(scene, table, fragments, 0, num_rows=h)
     band = min(max(1, SAMPLES_PER_BAND // max(w * s, 1)), max(h, 1))
     starts = jnp.arange(-(-h // band), dtype=jnp.int32) * band
     interpolated = jax.lax.map(

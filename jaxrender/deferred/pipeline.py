@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxrender.camera import Camera, clip_from_world, depth_range
-from jaxrender.checks import check_one_of
+from jaxrender.checks import check_at_least, check_one_of
 from jaxrender.deferred.bands import band_starts, in_bands
+from jaxrender.deferred.cutouts import bleed_colors
 from jaxrender.deferred.gbuffer import (
     POINT_FIELDS,
     SAMPLES_PER_BAND,
@@ -18,6 +19,7 @@ from jaxrender.deferred.gbuffer import (
     GBuffer,
     attribute_table,
     gbuffer_rows,
+    make_gbuffer,
     surface_points,
     with_motion,
 )
@@ -36,11 +38,11 @@ SAMPLES_PER_BLOCK = 1024
 
 
 def scene_textures(scene: Scene) -> Textures | None:
-    """Mip chains of the scene's images; None if it has none."""
+    """Mip chains of the scene's images, colors of hidden texels filled in; None if it has none."""
     if not scene.images:
         return None
     return build_textures(
-        [image.texels for image in scene.images],
+        [bleed_colors(i.texels) if i.srgb and i.texels.shape[-1] == 4 else i.texels for i in scene.images],
         wrap=[image.wrap for image in scene.images],
         srgb=[image.srgb for image in scene.images],
     )
@@ -64,7 +66,7 @@ def default_lights() -> tuple[Lights, Float[Array, "3 9"]]:
 def clip_positions(scene: Scene, camera: Camera, *, height: int, width: int) -> Float[Array, "v 4"]:
     """The scene's vertices in the camera's clip space, with the tightest depth range that holds them."""
     near, far = depth_range(camera, *scene_bounds(scene))
-    matrix = clip_from_world(camera, height=height, width=width, near=near, far=far)
+    matrix = clip_from_world(camera, height=max(height, 1), width=max(width, 1), near=near, far=far)
     return matmul(jnp.pad(scene.positions, ((0, 0), (0, 1)), constant_values=1.0), matrix.T)
 
 
@@ -83,6 +85,7 @@ def see(
     Not for use inside `jit`.
 
     Args:
+      textures: of `scene_textures`, made here if they are needed and not given.
       transparency: "test" discards masked texels below their cutoff, as glTF rules, and draws blended materials as
         opaque; "coverage" turns the alpha of both into a share of the samples (`late.alpha_to_coverage`), which wants
         several of them; "none" takes everything as opaque.
@@ -95,9 +98,10 @@ def see(
     )
     draw = functools.partial(rasterize_triangles, faces=scene.faces, height=height, width=width, samples=samples)
     mode = scene.material.alpha_mode[scene.material_id]
-    clear = {"test": mode == MASK, "coverage": mode != OPAQUE, "none": mode < OPAQUE}[transparency]
+    clear = {"test": mode == MASK, "coverage": mode != OPAQUE, "none": jnp.zeros_like(mode, bool)}[transparency]
     if not bool(clear.any()):
         return draw(triangles)
+    textures = scene_textures(scene) if textures is None else textures
     early, late = _split(triangles, clear)
     table = _table(scene, triangles, None, grid=samples.grid)
     keep = functools.partial(
@@ -129,11 +133,13 @@ def _keep(
     """The shader of masked materials; textures are looked up trilinearly."""
     gbuffer, _ = surface_points(scene, table, late.triangle_id, late.screen_id, late.barycentrics, late.w)
     surface = look_up_surface(gbuffer, scene.material, textures, max_anisotropy=1, slots=("base_color_texture",))
-    if coverage:
-        return alpha_to_coverage(surface.alpha, late.place, num_samples=num_samples, width=width), late.depth
     material = jnp.maximum(gbuffer.material_id, 0)
-    discards = scene.material.alpha_mode[material] == MASK
-    return ~discards | (surface.alpha >= scene.material.alpha_cutoff[material]), late.depth
+    masked, cutoff = scene.material.alpha_mode[material] == MASK, scene.material.alpha_cutoff[material]
+    if coverage:
+        # The edge of a mask stays where the cutoff puts it, twice as steep.
+        alpha = jnp.where(masked, jnp.clip(2.0 * (surface.alpha - cutoff) + 0.5, 0.0, 1.0), surface.alpha)
+        return alpha_to_coverage(alpha, late.place, num_samples=num_samples, width=width), late.depth
+    return ~masked | (surface.alpha >= cutoff), late.depth
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,6 +176,8 @@ def render_scene(
       lights, ambient: instead of the scene's.
       transparency: as in `see`; model: as in `shade`; previous_clip: as in `make_gbuffer`.
     """
+    check_at_least("height", height, 1)
+    check_at_least("width", width, 1)
     textures = scene_textures(scene) if textures is None else textures
     if lights is None and ambient is None and not len(scene.lights.kind):
         lights, ambient = default_lights()
@@ -240,6 +248,8 @@ def draw_gbuffer(
 ) -> GBuffer:
     """`make_gbuffer` for large images: on all cores, in bounded memory. Not for use inside `jit`."""
     height, width, num_samples = fragments.triangle_id.shape
+    if not fragments.triangle_id.size:
+        return make_gbuffer(scene, fragments, previous_clip=previous_clip)
     table = _table(scene, fragments.triangles, previous_clip, grid=fragments.samples.grid)
     band = min(max(1, 2 * SAMPLES_PER_BAND // (width * num_samples)), height)
     rows = functools.partial(

@@ -16,6 +16,7 @@ from jaxrender.camera import Camera, camera_rays, clip_from_world, depth_range
 from jaxrender.deferred.interpolate import interpolate
 from jaxrender.deferred.raster import Fragments, rasterize
 from jaxrender.deferred.samples import ordered_grid
+from jaxrender.vecmath import matmul
 
 
 def visible_surface(
@@ -35,7 +36,7 @@ def visible_surface(
     own = dataclasses.replace(camera, eye=jnp.zeros(3, jnp.float32), target=ahead)
     near, far = depth_range(own, about.min(axis=0), about.max(axis=0))
     matrix = clip_from_world(own, height=height, width=width, near=near, far=far)
-    clip = jnp.pad(about, ((0, 0), (0, 1)), constant_values=1.0) @ matrix.T
+    clip = matmul(jnp.pad(about, ((0, 0), (0, 1)), constant_values=1.0), matrix.T)
     return rasterize(clip, jnp.asarray(faces), height=height, width=width, samples=ordered_grid(samples_per_axis))
 
 

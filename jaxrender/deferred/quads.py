@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxrender.checks import check_at_least, check_same_shape
-from jaxrender.deferred.binning import TileGrid, pairs, rows_of_triangles, spans
+from jaxrender.deferred.binning import TileGrid, pairs, rows_of_triangles, spans, total
 from jaxrender.deferred.coverage import Lanes, TriangleRows, cover, set_up_pairs, set_up_triangles
 from jaxrender.deferred.interpolate import blend, sample_places, weights_at
-from jaxrender.deferred.raster import Fragments
+from jaxrender.deferred.raster import Fragments, room_for
 from jaxrender.deferred.samples import Samples
 from jaxrender.deferred.triangles import SUBPIXELS, ScreenTriangles
 from jaxrender.metrics import heatmap
@@ -169,16 +169,11 @@ def quad_coverage(fragments: Fragments) -> Quads:
 def _tile_pairs(triangles: ScreenTriangles, grid: TileGrid, pattern: Samples):
     """Tile and triangle of all pairs that may touch, in drawing order, as NumPy arrays."""
     first_row, num_rows = _rows(triangles, grid, pattern)
-    room = _power_of_two(int(jnp.sum(num_rows)))
+    room = room_for(int(total(num_rows)))
     runs = _spans(triangles, grid, pattern, first_row=first_row, num_rows=num_rows, max_spans=room)
-    total = int(jnp.sum(runs.count))
-    tile, triangle = _pairs(runs, max_pairs=_power_of_two(total), num_tiles=grid.count)
-    return np.asarray(tile)[:total], np.asarray(triangle)[:total]
-
-
-def _power_of_two(count: int) -> int:
-    """The first one above `count`, so that few different programs are compiled."""
-    return 1 << count.bit_length()
+    num_pairs = int(total(runs.count))
+    tile, triangle = _pairs(runs, max_pairs=room_for(num_pairs), num_tiles=grid.count)
+    return np.asarray(tile)[:num_pairs], np.asarray(triangle)[:num_pairs]
 
 
 def _quad_masks(

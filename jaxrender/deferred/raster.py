@@ -24,15 +24,20 @@ from jaxrender.deferred.binning import (
     spans,
     tile_grid,
     tile_lists,
+    total,
 )
 from jaxrender.deferred.clipping import clip_triangles, sort_out
 from jaxrender.deferred.coverage import Lanes, barycentrics_at, set_up_pairs, set_up_triangles
 from jaxrender.deferred.fill import Plan, Work, fill_strip
 from jaxrender.deferred.samples import CENTER, Samples
 from jaxrender.deferred.triangles import ScreenTriangles, project_triangles
+from jaxrender.machine import num_cores
 
 # Tiles of a strip, and those worked on in lockstep: what a core's cache holds.
 TILES_PER_STRIP, TILES_PER_CHUNK = 2048, 128
+
+# A point to the right of any picture, in place of a mesh without triangles.
+_ASIDE = np.array([[4.0, 0.0, 0.0, 1.0]])
 
 
 @jax.tree_util.register_dataclass
@@ -102,15 +107,24 @@ def rasterize_within(
 ) -> tuple[Fragments, Demand]:
     """The pure form, for `jit` and `vmap`: fixed capacity, and the demand beside the result.
 
-    Args as in `rasterize`. If the demand exceeds the budget, some triangles are missing from the image.
+    Args as in `rasterize`, but for indices out of range: such triangles are skipped. If the demand exceeds the budget,
+    some triangles are missing from the image.
     """
+    if not len(faces):
+        clip, faces = jnp.asarray(_ASIDE, clip.dtype), jnp.zeros((1, 3), faces.dtype)
+    if not height * width:
+        one, demand = rasterize_within(clip, faces, budget, height=1, width=1, samples=samples, cull=cull)
+        return _nothing(height, width, faces, one.triangles, samples), jax.tree.map(jnp.zeros_like, demand)
     grid, pattern = tile_grid(height, width, samples)
     h, w = grid.height, grid.width
-    clipped, num_clipped = clip_triangles(clip, faces, height=h, width=w, max_clipped=budget.max_clipped)
-    triangles = project_triangles(clipped, height=h, width=w, cull=cull)
+    in_range = ((faces >= 0) & (faces < len(clip))).all(axis=1)
+    known = jnp.where(in_range[:, None], faces, 0)
+    room = [max(limit, 1) for limit in (budget.max_clipped, budget.max_spans, budget.max_pairs)]
+    clipped, num_clipped = clip_triangles(clip, known, height=h, width=w, max_clipped=room[0])
+    triangles = project_triangles(clipped, height=h, width=w, cull=cull, drawn=in_range)
     first_row, num_rows = rows_of_triangles(triangles, grid, pattern)
-    runs = spans(triangles, grid, pattern, first_row=first_row, num_rows=num_rows, max_spans=budget.max_spans)
-    tile, triangle = pairs(runs, max_pairs=budget.max_pairs, num_tiles=grid.count)
+    runs = spans(triangles, grid, pattern, first_row=first_row, num_rows=num_rows, max_spans=room[1])
+    tile, triangle = pairs(runs, max_pairs=room[2], num_tiles=grid.count)
     tile, triangle = sort_pairs(tile, triangle)
     plan = _plan(grid, pattern, samples, tiles_per_chunk, TILES_PER_STRIP)
     work = _work(triangles, tile, triangle, grid, pattern)
@@ -118,13 +132,20 @@ def rasterize_within(
     strips = jax.lax.map(fill, jnp.arange(plan.num_strips, dtype=jnp.int32))
     images = {name: values.reshape(-1, *values.shape[2:])[:height] for name, values in strips.items()}
     fragments = Fragments(**images, faces=faces, triangles=triangles, samples=samples)
-    return fragments, Demand(num_clipped, jnp.sum(num_rows), jnp.sum(runs.count))
+    return fragments, Demand(num_clipped, total(num_rows), total(runs.count))
+
+
+def _nothing(height: int, width: int, faces, triangles: ScreenTriangles, samples: Samples) -> Fragments:
+    """An image without pixels."""
+    shape = height, width, samples.count
+    none, zero = jnp.full(shape, -1, jnp.int32), jnp.zeros(shape, jnp.float32)
+    return Fragments(none, none, jnp.zeros((*shape, 2), jnp.float32), zero, zero, faces, triangles, samples)
 
 
 def _plan(grid: TileGrid, pattern: Samples, samples: Samples, tiles_per_chunk: int, tiles_per_strip: int) -> Plan:
     """Strips of whole rows of tiles that are whole rows of pixels as well."""
     step = samples.grid // math.gcd(samples.grid, grid.size)
-    rows = max(1, tiles_per_strip // max(grid.columns, 1) // step) * step
+    rows = max(1, round(tiles_per_strip / grid.columns / step)) * step
     return Plan(grid, pattern, rows, tiles_per_chunk)
 
 
@@ -219,7 +240,7 @@ def screen_triangles(
     check_last_axis("faces", faces, 3)
     _check_indices(faces, len(clip))
     if not len(faces):
-        clip, faces, drawn, two_sided = jnp.zeros((1, 4), jnp.float32), jnp.zeros((1, 3), jnp.int32), None, None
+        clip, faces, drawn, two_sided = jnp.asarray(_ASIDE, jnp.float32), jnp.zeros((1, 3), jnp.int32), None, None
     # An image without pixels still has its triangles.
     grid, _ = tile_grid(max(height, 1), max(width, 1), samples)
     clip, faces = jnp.asarray(clip, jnp.float32), jnp.asarray(faces, jnp.int32)
@@ -235,13 +256,16 @@ def rasterize_triangles(
     grid, pattern = tile_grid(height, width, samples)
     faces = jnp.asarray(faces, jnp.int32)
     if not grid.count:
-        shape = height, width, samples.count
-        none, zero = jnp.full(shape, -1, jnp.int32), jnp.zeros(shape, jnp.float32)
-        return Fragments(none, none, zero[..., None].repeat(2, -1), zero + 1.0, zero, faces, triangles, samples)
+        return _nothing(height, width, faces, triangles, samples)
     work = bin_triangles(triangles, grid, pattern)
     # On a processor several strips are under way at once; on another device the whole image is one.
     on_cpu = jax.default_backend() == "cpu"
-    plan = _plan(grid, pattern, samples, *((TILES_PER_CHUNK, TILES_PER_STRIP) if on_cpu else (16384, grid.count)))
+    if on_cpu:
+        # As many strips as keep all cores busy to the end.
+        turns = -(-grid.count // (TILES_PER_STRIP * num_cores()))
+        plan = _plan(grid, pattern, samples, TILES_PER_CHUNK, -(-grid.count // (turns * num_cores())))
+    else:
+        plan = _plan(grid, pattern, samples, 16384, grid.count)
     rows = plan.rows_per_strip * grid.size // samples.grid
 
     def fill(start: int) -> dict[str, Array]:
@@ -255,9 +279,9 @@ def rasterize_triangles(
 
 def bin_triangles(triangles: ScreenTriangles, grid: TileGrid, pattern: Samples) -> Work:
     """Pairs of tile and triangle, as many as there are, sorted by tile."""
-    first_row, num_rows, total = _rows(triangles, grid, pattern)
-    runs, total = _spans(triangles, grid, pattern, first_row, num_rows, max_spans=room_for(int(total)))
-    tile, triangle = _pairs(runs, max_pairs=room_for(int(total)), num_tiles=grid.count)
+    first_row, num_rows, num_spans = _rows(triangles, grid, pattern)
+    runs, num_pairs = _spans(triangles, grid, pattern, first_row, num_rows, max_spans=room_for(int(num_spans)))
+    tile, triangle = _pairs(runs, max_pairs=room_for(int(num_pairs)), num_tiles=grid.count)
     tile, triangle = _sorted_pairs(tile, triangle, grid.count)
     return _work_jit(triangles, tile, triangle, grid, pattern)
 
@@ -270,7 +294,13 @@ def _check_indices(faces: Int[Array, "t 3"], num_vertices: int) -> None:
 
 
 def room_for(count: int) -> int:
-    """At least `count`, in steps of a quarter or less or of 256: frames of a film compile few different programs."""
+    """At least `count`, in steps of a quarter or less or of 256: frames of a film compile few different programs.
+
+    Raises:
+      ValueError: if `count` is beyond int32.
+    """
+    if count >= np.iinfo(np.int32).max:
+        raise ValueError("triangles: expected fewer than 2^31 pairs of triangle and tile, got more: draw fewer at once")
     step = max(256, 1 << max(count.bit_length() - 3, 0))
     return -(-max(count, 1) // step) * step
 
@@ -289,13 +319,13 @@ def _set_up(clip, faces, grid, masks, *, cull, max_clipped):
 @functools.partial(jax.jit, static_argnames=("grid", "pattern"))
 def _rows(triangles, grid, pattern):
     first_row, num_rows = rows_of_triangles(triangles, grid, pattern)
-    return first_row, num_rows, jnp.sum(num_rows)
+    return first_row, num_rows, total(num_rows)
 
 
 @functools.partial(jax.jit, static_argnames=("grid", "pattern", "max_spans"))
 def _spans(triangles, grid, pattern, first_row, num_rows, *, max_spans):
     runs = spans(triangles, grid, pattern, first_row=first_row, num_rows=num_rows, max_spans=max_spans)
-    return runs, jnp.sum(runs.count)
+    return runs, total(runs.count)
 
 
 _pairs = jax.jit(pairs, static_argnames=("max_pairs", "num_tiles"))

@@ -17,7 +17,7 @@ KNOWN_LAYERS: dict[str, tuple[int, tuple[str, ...]]] = {
     "depth": (1, ("depth", "depth.z", "depth.y", "depth.v", "z", "dd", "dd.y", "zdepth")),
     "uv": (2, ("uv", "st", "texcoord", "tex_coord")),
     "albedo": (3, ("albedo", "diffcol", "diffuse_albedo", "basecolor", "base_color", "diffuse_color")),
-    "motion": (2, ("motion", "motion_vector", "motionvector", "vector", "mv")),
+    "motion": (2, ("motion", "motion_vector", "motionvector", "mv")),
     "material_id": (1, ("materialid", "material_id", "indexma.x", "indexma", "matid")),
     "triangle_id": (1, ("triangleid", "triangle_id", "prim_index", "primid")),
 }

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 
 from jaxrender.camera import Camera, clip_from_world, project_px
 from jaxrender.deferred import (
@@ -13,12 +14,14 @@ from jaxrender.deferred import (
     Budget,
     clip_positions,
     draw_gbuffer,
+    draw_late,
     gbuffer_from_layers,
     make_gbuffer,
     ordered_grid,
     pipeline,
     raster,
     rasterize,
+    rasterize_triangles,
     rasterize_within,
     scene_textures,
     see,
@@ -116,3 +119,60 @@ def test_a_multilayer_file_of_others_is_read(shared_data):
     assert "depth" in known
     with pytest.raises(ValueError, match="normal"):
         gbuffer_from_layers(known, camera=Camera(*(jnp.zeros(3) for _ in range(3)), jnp.float32(1.0)), name=str(path))
+
+
+@pytest.mark.parametrize(("height", "width"), [(0, 5), (4, 0), (0, 0)])
+def test_images_without_pixels(scene, height, width):
+    size = {"height": height, "width": width}
+    camera = whole_scene_camera(scene)
+    fragments = see(scene, camera, **size)
+    for gbuffer in (make_gbuffer(scene, fragments), draw_gbuffer(scene, fragments)):
+        assert gbuffer.position.shape == (height, width, 1, 3) and gbuffer.triangle_id.shape == (height, width, 1)
+    within, demand = rasterize_within(clip_positions(scene, camera, height=4, width=4), scene.faces,
+                                      Budget(8, 8, 8), **size)  # fmt: skip
+    assert within.depth.shape == (height, width, 1) and not bool(demand.exceeds(Budget(0, 0, 0)))
+
+
+def test_the_pure_form_on_nothing_and_on_wrong_indices(scene):
+    clip = clip_positions(scene, whole_scene_camera(scene, aspect=61 / 45), **SIZE)
+    none, demand = rasterize_within(clip, scene.faces[:0], Budget(0, 0, 0), **SIZE)
+    assert not bool(none.coverage.any()) and not bool(demand.exceeds(Budget(0, 0, 0)))
+    budget = Budget(64, 8192, 8192)
+    wrong = scene.faces.at[::2, 1].set(len(clip)).at[1::4, 2].set(-1)
+    got, _ = rasterize_within(clip, wrong, budget, **SIZE)
+    kept = np.asarray(((wrong >= 0) & (wrong < len(clip))).all(axis=1))
+    expected = rasterize(clip, scene.faces, **SIZE, drawn=jnp.asarray(kept))
+    assert 0 < kept.sum() < len(kept) and bool(expected.coverage.any())
+    np.testing.assert_array_equal(got.triangle_id, expected.triangle_id)
+
+
+def test_more_pairs_than_there_are_numbers_for_are_refused():
+    """4,101 rectangles over 16,352² samples: 4.3 thousand millions of pairs."""
+    corners = jnp.asarray([[-1, -1, 0.5, 1], [1, -1, 0.5, 1], [1, 1, 0.5, 1], [-1, 1, 0.5, 1]], jnp.float32)
+    faces = jnp.tile(jnp.asarray([[0, 1, 2], [0, 2, 3]], jnp.int32), (4101, 1))
+    with pytest.raises(ValueError, match="fewer than 2\\^31 pairs"):
+        rasterize(corners, faces, height=16352, width=16352)
+
+
+@pytest.mark.parametrize("side", [64, 97])
+def test_closed_meshes_have_as_many_fronts_as_backs(side, rng):
+    """Along every line of sight a closed surface is entered as often as it is left, sample by sample."""
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    lumps = 1.0 + 0.5 * np.sin(7 * sphere.vertices @ rng.normal(size=(3, 1)))
+    points = sphere.vertices * lumps * [0.6, 0.5, 0.3] + [0.0, 0.0, 0.5]
+    clip = jnp.asarray(np.concatenate([points, np.ones((len(points), 1))], axis=1), jnp.float32)
+    faces, size = jnp.asarray(sphere.faces, jnp.int32), {"height": side, "width": side}
+    triangles = raster.screen_triangles(clip, faces, **size)
+    nothing = rasterize_triangles(dataclasses.replace(triangles, valid=triangles.valid & False), faces, **size)
+    fronts, backs = np.zeros(side * side, int), np.zeros(side * side, int)
+    front = np.asarray(triangles.front)
+
+    def count(late):
+        place, own = np.asarray(late.place), np.asarray(late.screen_id)
+        np.add.at(fronts, place[(own >= 0) & front[own]], 1)
+        np.add.at(backs, place[(own >= 0) & ~front[own]], 1)
+        return np.zeros(len(place), bool), np.asarray(late.depth)
+
+    draw_late(nothing, triangles, count)
+    np.testing.assert_array_equal(fronts, backs)
+    assert (fronts > 0).mean() > 0.2 and fronts.max() > 1

@@ -121,7 +121,7 @@ def test_a_gbuffer_survives_a_file(tmp_path):
     "names",
     [
         {"normal": "ViewLayer.Normal", "depth": "ViewLayer.Depth", "position": "ViewLayer.Position",
-         "uv": "ViewLayer.UV", "albedo": "ViewLayer.DiffCol", "motion": "ViewLayer.Vector"},  # Blender
+         "uv": "ViewLayer.UV", "albedo": "ViewLayer.DiffCol"},  # Blender
         {"normal": "sh_normal", "geometric_normal": "geo_normal", "position": "position", "uv": "uv", "depth": "dd.y",
          "albedo": "albedo"},  # Mitsuba
         {"normal": "Ns", "geometric_normal": "N", "position": "P", "albedo": "Albedo"},  # pbrt
@@ -129,13 +129,24 @@ def test_a_gbuffer_survives_a_file(tmp_path):
     ],
 )  # fmt: skip
 def test_layers_of_other_renderers_are_known(names, rng, tmp_path):
-    counts = {"depth": 1, "uv": 2, "motion": 4 if names.get("motion", "").startswith("View") else 2}
+    counts = {"depth": 1, "uv": 2}
     values = {ours: rng.uniform(0.1, 1, (4, 5, counts.get(ours, 3))).astype(np.float32) for ours in names}
     write_exr(tmp_path / "x.exr", {theirs: values[ours] for ours, theirs in names.items()})
     found = known_layers(read_exr_layers(tmp_path / "x.exr"))
     assert set(found) == set(names)
     for ours in names:
         np.testing.assert_array_equal(found[ours], values[ours][..., : found[ours].shape[-1]])
+
+
+def test_distance_along_rays_becomes_depth():
+    gbuffer, camera = drawn()
+    layers = {name: v for name, v in known_layers(gbuffer_layers(gbuffer, sample=0)).items() if name != "position"}
+    away = np.linalg.norm(np.asarray(gbuffer.position)[:, :, 0] - np.asarray(camera.eye), axis=-1, keepdims=True)
+    some = np.asarray(gbuffer.coverage)
+    back = gbuffer_from_layers({**layers, "depth": np.where(some, away, 0.0)}, camera=camera, depth_kind="distance")
+    np.testing.assert_allclose(back.depth, gbuffer.depth, rtol=2e-4, atol=1e-6)
+    with pytest.raises(InputError, match="the camera of a depth along rays"):
+        gbuffer_from_layers({**layers, "position": layers["normal"]}, depth_kind="distance")
 
 
 def test_uv_with_alpha_as_blender_writes_it(tmp_path, rng):

@@ -44,6 +44,7 @@ EXCEPTIONS = {
     "deferred.gbuffer.attribute_table": "the same",
     "deferred.gbuffer.plane_slopes": "the same; the twin solves for the weights",
     "deferred.gbuffer.gbuffer_rows": "jaxrender's own way: bands of an image",
+    "deferred.gbuffer.with_motion": "a step of make_gbuffer, which is compared as a whole",
     "deferred.gbuffer.surface_points": "the same, for lists of fragments",
     "deferred.late.draw_late": "a driver: finds fragments and calls the shader; judged in tests/deferred",
     "harmonics.sh.triple_product_tensor": "torchref's way to the product",
