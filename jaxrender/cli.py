@@ -103,7 +103,8 @@ class SceneView:
     fov_degrees: float = 60.0
     """Vertical field of view, with --eye or --inside."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises ValueError, naming the option; here, and not when made, so that it is told in one line."""
         if self.eye is not None and (self.inside or not all(map(math.isfinite, (*self.eye, *self.target)))):
             raise ValueError("--eye, --target: expected finite numbers, and not --inside as well")
         if self.eye is not None and self.eye == self.target:
@@ -140,6 +141,7 @@ class Render(SceneView):
     def run(self) -> None:
         from jaxrender.render_command import run_render
 
+        self.check()
         console.enable_compilation_cache()
         run_render(self)
 
@@ -160,6 +162,7 @@ class Quads(SceneView):
     def run(self) -> None:
         from jaxrender.quads_command import run_quads
 
+        self.check()
         console.enable_compilation_cache()
         run_quads(self)
 

@@ -10,9 +10,11 @@ import pytest
 from PIL import Image
 from safetensors.numpy import load_file, save_file
 
+import jaxrender.io
 from fitting.cli import main
 from fitting.model import MODEL_FILE, find_model
 from jaxrender.io import read_exr
+from jaxrender.io.builtin_scene import builtin_scene
 
 README = pathlib.Path(__file__).resolve().parents[2] / "README.md"
 SMALL = [
@@ -119,11 +121,16 @@ def test_a_model_that_does_not_fit_is_refused_in_one_line(run, tmp_path, capsys,
 
 
 def test_the_readme_examples_run_as_printed(run, monkeypatch):
-    relit, raster = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
+    relit, raster, whole = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
     monkeypatch.chdir(run)
     names: dict = {}
     exec(raster, names)
     assert names["values"].shape == names["duv_dx"].shape == (64, 64, 4, 2)
+    # The scene is the built-in one, and the picture small.
+    monkeypatch.setattr(jaxrender.io, "load_scene", lambda _: builtin_scene(num_vertices=1500))
+    exec(whole.replace('{"height": 768, "width": 1024}', '{"height": 36, "width": 48}'), names)
+    assert names["picture"].shape == (36, 48, 3) and names["picture"].max() > 0.05
+    assert read_exr(run / "gbuffer.exr", layer="normal").shape == (36, 48, 3)
     exec(relit, names)
     positions, colors = np.asarray(names["positions"]), np.asarray(names["colors"])
     assert positions.shape == colors.shape == (3273, 3)
