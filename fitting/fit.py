@@ -1,8 +1,6 @@
 """The fit of all points, block by block: greedy axes, linear solve, joint refinement, offset."""
 
 import functools
-import itertools
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,7 +29,7 @@ from fitting.stages import Track, no_tracking
 from fitting.training_data import TrainingData
 from jaxrender.harmonics.pose_model import FeatureBasis, PoseModel
 from jaxrender.harmonics.zh_fit import spread_start_axes
-from jaxrender.machine import num_cores
+from jaxrender.machine import on_all_cores
 
 NUM_STARTS = 3
 
@@ -85,14 +83,11 @@ def fit_model(data: TrainingData, fit: FitSettings, *, ridge: float, track: Trac
         return fit_block(rows, block_sh(bits[:, block.padded], data.table), fit)
 
     # XLA runs each block on its calling thread (jaxrender.machine); two blocks at a time keep two cores busy.
-    # The first block alone compiles what all share.
-    first = solve(todo[0])
-    with ThreadPoolExecutor(num_cores()) as threads:
-        solutions = itertools.chain([first], threads.map(solve, todo[1:]))
-        for block in track(iter(todo), len(todo), "fit"):
-            solved, n = next(solutions), len(block.points)
-            numbers[..., block.points] = np.swapaxes(solved[0], 1, 2)[..., :n]
-            axes[block.points], offset[block.points] = solved[1][:n], solved[2][:n]
+    solutions = on_all_cores(solve, todo)
+    for block in track(iter(todo), len(todo), "fit"):
+        solved, n = next(solutions), len(block.points)
+        numbers[..., block.points] = np.swapaxes(solved[0], 1, 2)[..., :n]
+        axes[block.points], offset[block.points] = solved[1][:n], solved[2][:n]
     return PoseModel(
         features=basis,
         weights=jnp.asarray(numbers),

@@ -5,7 +5,7 @@ import hashlib
 import os
 import pathlib
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
@@ -34,14 +34,14 @@ def keep_xla_to_one_thread() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
 
 
-def on_all_cores(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """function(item) of all items, in their order, as many at once as there are cores.
+def on_all_cores(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+    """Gives function(item) of all items, in their order, as many at once as there are cores.
 
     The first one runs alone: what it compiles is there for the others, and no two threads compile at once.
     """
-    first = [function(item) for item in items[:1]]
+    yield from map(function, items[:1])
     with ThreadPoolExecutor(num_cores()) as threads:
-        return first + list(threads.map(function, items[1:]))
+        yield from threads.map(function, items[1:])
 
 
 def cpu_model() -> str:

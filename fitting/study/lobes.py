@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +16,7 @@ from fitting.stages import Track
 from fitting.study.ground import Ground, LinearPose, MethodRow, method_row
 from jaxrender.harmonics.pose_model import lobes_from_numbers
 from jaxrender.harmonics.zh import lobes_to_sh
-from jaxrender.machine import num_cores
+from jaxrender.machine import on_all_cores
 
 LOBE_COUNTS = (1, 2, 3)
 # Points of a block in the study, whose points are few per group.
@@ -31,8 +30,7 @@ def in_blocks(function: Callable, *arrays: np.ndarray, size: int = 1024):
         rows = [array[start : start + size] for array in arrays]
         return np.asarray(function(*(padded(r, size) for r in rows)))[: len(rows[0])]
 
-    with ThreadPoolExecutor(num_cores()) as threads:
-        return np.concatenate(list(threads.map(one, range(0, len(arrays[0]), size))))
+    return np.concatenate(list(on_all_cores(one, range(0, len(arrays[0]), size))))
 
 
 _from_charts = jax.jit(synthesize)
@@ -162,10 +160,9 @@ def refined_lobes(ground: Ground, num_lobes: int, *, offset: bool, track: Track)
         components = linear.components[:, block.group].astype(np.float32)
         return np.asarray(predict_block(components, *fitted))[:, : len(block.points)]
 
-    with ThreadPoolExecutor(num_cores()) as threads:
-        solved = threads.map(solve, todo)
-        for block in track(iter(todo), len(todo), count_lobes(num_lobes)):
-            result[:, block.points] = next(solved)
+    solved = on_all_cores(solve, todo)
+    for block in track(iter(todo), len(todo), count_lobes(num_lobes)):
+        result[:, block.points] = next(solved)
     return result
 
 

@@ -25,23 +25,25 @@ def in_bands(function: Callable[[int], Tree], starts: Sequence[int], *, height: 
     """
     if len(starts) == 1:
         return jax.tree.map(lambda values: values[:height], function(starts[0]))
-    first = jax.block_until_ready(function(starts[0]))
     if jax.default_backend() != "cpu":
-        bands = [first, *(function(start) for start in starts[1:])]
+        bands = [function(start) for start in starts]
         ends = [*starts[1:], height]
         kept = [jax.tree.map(lambda v, n=end - start: v[:n], band)
                 for band, start, end in zip(bands, starts, ends, strict=True)]  # fmt: skip
         return jax.tree.map(lambda *values: jnp.concatenate(values), *kept)
-    whole = jax.tree.map(lambda values: _room(height, values), first)
+    whole: list[Tree] = []
 
-    def put(start: int, band: Tree) -> None:
-        for target, values in zip(jax.tree.leaves(whole), jax.tree.leaves(band), strict=True):
+    def put(start: int) -> None:
+        band = function(start)
+        if not whole:  # the first band, which runs alone, tells shapes and types
+            whole.append(jax.tree.map(lambda values: _room(height, values), band))
+        for target, values in zip(jax.tree.leaves(whole[0]), jax.tree.leaves(band), strict=True):
             own = target[start : start + len(values)]
             own[...] = np.asarray(values)[: len(own)]
 
-    put(starts[0], first)
-    on_all_cores(lambda start: put(start, function(start)), starts[1:])
-    return jax.tree.map(jax.device_put, whole)
+    for _ in on_all_cores(put, starts):
+        pass
+    return jax.tree.map(jax.device_put, whole[0])
 
 
 def band_starts(height: int, band: int) -> list[int]:

@@ -13,8 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxrender.deferred.binning import TileGrid
 from jaxrender.deferred.samples import Samples
-from jaxrender.deferred.triangles import SUBPIXELS, ScreenTriangles, edge
-from jaxrender.vecmath import safe_div
+from jaxrender.deferred.triangles import SUBPIXELS, ScreenTriangles, corner_planes, edge, plane_steps
 
 
 @dataclass(frozen=True)
@@ -79,24 +78,13 @@ def set_up_triangles(triangles: ScreenTriangles, lanes: Lanes) -> TriangleRows:
     """Steps from lane to lane of everything that is linear on the screen."""
     start, end = triangles.xy, jnp.roll(triangles.xy, -1, axis=1)
     dx, dy = ((end - start)[..., axis] for axis in (0, 1))
-    # Corner k lies opposite to edge k+1.
-    step = lanes.unit / triangles.area[:, None]
-    right, down = (jnp.roll(d.astype(step.dtype), -1, axis=1) * step for d in (-dy, dx))
-    corners = _corner_planes(triangles)
-    slopes = [[sum(d[:, k] * plane[k] for k in range(3)) for plane in corners] for d in (right, down)]
+    right, down = plane_steps(triangles, unit=lanes.unit)
     z = triangles.z
     return TriangleRows(
         edges=jnp.concatenate([-dy, dx], axis=1),
-        depth=jnp.stack([slopes[0][0], slopes[1][0], z.min(axis=1), z.max(axis=1)], axis=1),
-        planes=jnp.stack([*slopes[0][1:], *slopes[1][1:]], axis=1),
+        depth=jnp.stack([right[0], down[0], z.min(axis=1), z.max(axis=1)], axis=1),
+        planes=jnp.stack([*right[1:], *down[1:]], axis=1),
     )
-
-
-def _corner_planes(triangles: ScreenTriangles) -> list[list[Float[Array, " n"]]]:
-    """What is linear on the screen, at the three corners: window depth, 1/w, and b_1/w and b_2/w of the source."""
-    over_w = safe_div(jnp.ones_like(triangles.w), triangles.w)
-    b1, b2 = (triangles.weights[..., i] * over_w for i in (1, 2))
-    return [[values[:, k] for k in range(3)] for values in (triangles.z, over_w, b1, b2)]
 
 
 def set_up_pairs(
@@ -111,7 +99,7 @@ def set_up_pairs(
     own = triangles.xy.reshape(-1, 6)[triangle]
     corners = [(own[:, 2 * k], own[:, 2 * k + 1]) for k in range(3)]
     found = [edge(corners[k], corners[(k + 1) % 3], (x, y), unit=lanes.unit) for k in range(3)]
-    planes = jnp.stack([v for plane in _corner_planes(triangles) for v in plane] + [triangles.area], axis=1)[triangle]
+    planes = jnp.stack([v for plane in corner_planes(triangles) for v in plane] + [triangles.area], axis=1)[triangle]
     weights = [found[(k + 1) % 3][1] / planes[:, 12] for k in range(3)]
     values = [sum(weights[k] * planes[:, 3 * i + k] for k in range(3)) for i in range(4)]
     return PairRows(triangle, jnp.stack([c for c, _ in found], axis=1), jnp.stack(values, axis=1))

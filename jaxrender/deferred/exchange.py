@@ -20,11 +20,8 @@ from jaxrender.vecmath import dot, normalize
 #: Depths from here on mean that nothing is there: Blender writes 1e10, others infinity.
 FAR_AWAY = 1e9
 
-#: Layer -> field of `GBuffer`.
-_FIELDS = {
-    "normal": "normal", "geometric_normal": "geometric_normal", "position": "position", "depth": "depth", "uv": "uv",
-    "motion": "motion",
-}  # fmt: skip
+# Fields of `GBuffer` that are layers of the same name, and layers of ids with their field.
+_FIELDS = ("normal", "geometric_normal", "position", "depth", "uv", "motion")
 _IDS = {"materialid": "material_id", "triangleid": "triangle_id"}
 
 
@@ -46,7 +43,7 @@ def gbuffer_layers(gbuffer: GBuffer, *, sample: int | None = None) -> dict[str, 
             return values[:, :, sample]
         return np.sum(values * chosen[..., None], axis=2) / np.maximum(chosen.sum(axis=-1, keepdims=True), 1)
 
-    layers = {name: layer(getattr(gbuffer, f)) for name, f in _FIELDS.items() if getattr(gbuffer, f) is not None}
+    layers = {name: layer(getattr(gbuffer, name)) for name in _FIELDS if getattr(gbuffer, name) is not None}
     for name in ("normal", "geometric_normal"):
         length = np.linalg.norm(layers[name], axis=-1, keepdims=True)
         layers[name] = layers[name] / np.where(length > 0.0, length, 1.0)

@@ -14,9 +14,9 @@ from jaxrender.checks import check_last_axis
 from jaxrender.deferred.interpolate import sample_places
 from jaxrender.deferred.raster import Fragments
 from jaxrender.deferred.texture import Textures, sample_texture_grad
-from jaxrender.deferred.triangles import SUBPIXELS, ScreenTriangles
+from jaxrender.deferred.triangles import SUBPIXELS, ScreenTriangles, plane_steps
 from jaxrender.scene import Scene
-from jaxrender.vecmath import normalize, safe_div
+from jaxrender.vecmath import normalize
 
 #: Samples that are interpolated at a time; what they gather stays in a processor's cache.
 SAMPLES_PER_BAND = 1 << 15
@@ -92,24 +92,14 @@ def attribute_table(
     values += [] if previous_clip is None else [previous_clip]
     a, b, c = (jnp.concatenate(values, axis=1)[scene.faces[:, k]] for k in range(3))
     p = scene.positions[scene.faces]
+    right, down = plane_steps(triangles, unit=SUBPIXELS * grid)
     return AttributeTable(
         corner=jnp.concatenate([a, b - a, c - a], axis=1),
         flat=normalize(jnp.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])),
         material_id=scene.material_id,
-        slopes=plane_slopes(triangles) * grid,
+        slopes=jnp.stack([*right[1:], *down[1:]], axis=1),
         front=triangles.front,
     )
-
-
-def plane_slopes(triangles: ScreenTriangles) -> Float[Array, "n 6"]:
-    """Steps of 1/w, b_1/w and b_2/w, which are linear on the screen, per pixel to the right, then downwards."""
-    xy, over_w = triangles.xy.astype(triangles.w.dtype), safe_div(jnp.ones_like(triangles.w), triangles.w)
-    planes = [over_w, triangles.weights[..., 1] * over_w, triangles.weights[..., 2] * over_w]
-    scale = SUBPIXELS / triangles.area
-    # Of the weight of corner k: the edge opposite to it, turned by a quarter.
-    right = [-(xy[:, (k + 2) % 3, 1] - xy[:, (k + 1) % 3, 1]) * scale for k in range(3)]
-    down = [(xy[:, (k + 2) % 3, 0] - xy[:, (k + 1) % 3, 0]) * scale for k in range(3)]
-    return jnp.stack([sum(d[k] * p[:, k] for k in range(3)) for d in (right, down) for p in planes], axis=1)
 
 
 def make_gbuffer(
@@ -132,7 +122,7 @@ def make_gbuffer(
     h, w, s = fragments.triangle_id.shape
     if not fragments.triangle_id.size:
         return gbuffer_rows(scene, table, fragments, 0, num_rows=h)
-    band = min(max(1, SAMPLES_PER_BAND // max(w * s, 1)), max(h, 1))
+    band = min(max(1, SAMPLES_PER_BAND // (w * s)), h)
     starts = jnp.arange(-(-h // band), dtype=jnp.int32) * band
     interpolated = jax.lax.map(
         lambda start: gbuffer_rows(

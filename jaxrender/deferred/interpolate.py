@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxrender.checks import check_one_of
 from jaxrender.deferred.raster import Fragments
-from jaxrender.deferred.triangles import SUBPIXELS, perspective_weights, screen_barycentrics
+from jaxrender.deferred.triangles import SUBPIXELS, perspective_weights, screen_barycentrics, weight_steps
 from jaxrender.vecmath import safe_div
 
 MODES = ("perspective", "noperspective", "flat_first", "flat_last")
@@ -47,7 +47,7 @@ def corner_weights(fragments: Fragments, *, mode: str = "perspective") -> Float[
     check_one_of("mode", mode, MODES)
     b = fragments.barycentrics
     weights = jnp.concatenate([1.0 - b[..., :1] - b[..., 1:], b], axis=-1)
-    return weights if mode == "perspective" else _as_mode(fragments, weights, mode)
+    return _as_mode(fragments, weights, mode)
 
 
 def _as_mode(fragments: Fragments, weights: Float[Array, "h w s 3"], mode: str) -> Float[Array, "h w s 3"]:
@@ -187,10 +187,8 @@ def attribute_gradients(
     With l linear on the screen, A = Σ l_k A_k/w_k / Σ l_k/w_k, hence dA = w Σ dl_k/w_k (A_k - A).
     """
     triangles, row = fragments.triangles, jnp.maximum(fragments.screen_id, 0)
-    xy, scale = triangles.xy[row].astype(jnp.float32), fragments.samples.grid * float(SUBPIXELS)
-    start, end = jnp.roll(xy, -1, axis=-2), jnp.roll(xy, -2, axis=-2)
-    over = scale / triangles.area[row][..., None]
-    slope_x, slope_y = -(end[..., 1] - start[..., 1]) * over, (end[..., 0] - start[..., 0]) * over
+    unit = fragments.samples.grid * SUBPIXELS
+    slope_x, slope_y = weight_steps(triangles.xy[row], triangles.area[row], unit=unit)
     corners = fragments.faces[jnp.maximum(fragments.triangle_id, 0)]
     own = jnp.einsum("hwsij,hwsjc->hwsic", triangles.weights[row], attributes[corners], precision="highest")
     value = interpolate(fragments, attributes)

@@ -81,7 +81,7 @@ def draw_late(fragments: Fragments, triangles: ScreenTriangles, shader: Shader) 
         keep = keep & used & (depth >= 0.0) & (depth <= 1.0)
         return jax.tree.map(lambda values: np.asarray(values)[keep], dataclasses.replace(listed, depth=depth))
 
-    kept = on_all_cores(look, range(0, len(found[0]), block))
+    kept = list(on_all_cores(look, range(0, len(found[0]), block)))
     num_kept = sum(len(some.place) for some in kept)
     if not num_kept:
         return fragments

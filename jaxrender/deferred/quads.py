@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxrender.checks import check_at_least, check_same_shape
-from jaxrender.deferred.binning import TileGrid, pairs, rows_of_triangles, spans, total
+from jaxrender.deferred.binning import TileGrid
 from jaxrender.deferred.coverage import Lanes, TriangleRows, cover, set_up_pairs, set_up_triangles
 from jaxrender.deferred.interpolate import blend, sample_places, weights_at
-from jaxrender.deferred.raster import Fragments, room_for
+from jaxrender.deferred.raster import Fragments, tile_pairs
 from jaxrender.deferred.samples import Samples
 from jaxrender.deferred.triangles import SUBPIXELS, ScreenTriangles
 from jaxrender.metrics import heatmap
@@ -150,7 +150,8 @@ def quad_coverage(fragments: Fragments) -> Quads:
         return Quads(none, none, none, none, none, rows=(h + 1) // 2, columns=(w + 1) // 2)
     m, pattern = fragments.samples.grid, Samples(offsets=fragments.samples.offsets)
     grid = TileGrid(h * m, w * m, 16 if pattern.count == 1 else 8)
-    tile, triangle = _tile_pairs(fragments.triangles, grid, pattern)
+    tile, triangle = (np.asarray(v) for v in tile_pairs(fragments.triangles, grid, pattern))
+    tile, triangle = tile[tile < grid.count], triangle[tile < grid.count]
     rows = _triangle_rows(fragments.triangles, grid, pattern)
     half, found = grid.size // 2, []
     for start in range(0, len(tile), _CHUNK):
@@ -164,16 +165,6 @@ def quad_coverage(fragments: Fragments) -> Quads:
         triangle_id=fragments.triangles.source[screen_id], screen_id=screen_id, row=row, column=column, mask=mask,
         rows=(grid.height + 1) // 2, columns=(grid.width + 1) // 2,
     )  # fmt: skip
-
-
-def _tile_pairs(triangles: ScreenTriangles, grid: TileGrid, pattern: Samples):
-    """Tile and triangle of all pairs that may touch, in drawing order, as NumPy arrays."""
-    first_row, num_rows = _rows(triangles, grid, pattern)
-    room = room_for(int(total(num_rows)))
-    runs = _spans(triangles, grid, pattern, first_row=first_row, num_rows=num_rows, max_spans=room)
-    num_pairs = int(total(runs.count))
-    tile, triangle = _pairs(runs, max_pairs=room_for(num_pairs), num_tiles=grid.count)
-    return np.asarray(tile)[:num_pairs], np.asarray(triangle)[:num_pairs]
 
 
 def _quad_masks(
@@ -198,9 +189,6 @@ def _quad_masks(
     return jnp.sum(quads * lane_bits, axis=(2, 4)).reshape(-1, half * half)
 
 
-_rows = jax.jit(rows_of_triangles, static_argnames=("grid", "samples"))
-_spans = jax.jit(spans, static_argnames=("grid", "samples", "max_spans"))
-_pairs = jax.jit(pairs, static_argnames=("max_pairs", "num_tiles"))
 _triangle_rows = jax.jit(
     lambda triangles, grid, pattern: set_up_triangles(triangles, Lanes.of(grid.size, pattern)),
     static_argnames=("grid", "pattern"),

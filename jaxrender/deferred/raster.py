@@ -2,7 +2,7 @@
 
 The rules are those of Direct3D 11: corners snapped to 8 sub-pixel bits, exact edge functions, the top-left rule,
 depth interpolated linearly on the screen, nearest depth wins and the first triangle wins a tie. Coverage, triangle
-ids and depth order have no gradient; barycentrics have one (`interpolate.barycentrics`).
+ids and depth order have no gradient; barycentrics have one (`interpolate.differentiable_barycentrics`).
 """
 
 import functools
@@ -262,8 +262,8 @@ def rasterize_triangles(
     on_cpu = jax.default_backend() == "cpu"
     if on_cpu:
         # As many strips as keep all cores busy to the end.
-        turns = -(-grid.count // (TILES_PER_STRIP * num_cores()))
-        plan = _plan(grid, pattern, samples, TILES_PER_CHUNK, -(-grid.count // (turns * num_cores())))
+        num_strips = -(-grid.count // (TILES_PER_STRIP * num_cores())) * num_cores()
+        plan = _plan(grid, pattern, samples, TILES_PER_CHUNK, -(-grid.count // num_strips))
     else:
         plan = _plan(grid, pattern, samples, 16384, grid.count)
     rows = plan.rows_per_strip * grid.size // samples.grid
@@ -277,12 +277,18 @@ def rasterize_triangles(
     return Fragments(**images, faces=faces, triangles=triangles, samples=samples)
 
 
-def bin_triangles(triangles: ScreenTriangles, grid: TileGrid, pattern: Samples) -> Work:
-    """Pairs of tile and triangle, as many as there are, sorted by tile."""
+def tile_pairs(
+    triangles: ScreenTriangles, grid: TileGrid, pattern: Samples
+) -> tuple[Int[Array, " p"], Int[Array, " p"]]:
+    """Tile and triangle of all pairs that may touch, in drawing order; unused ones, at the end, name grid.count."""
     first_row, num_rows, num_spans = _rows(triangles, grid, pattern)
     runs, num_pairs = _spans(triangles, grid, pattern, first_row, num_rows, max_spans=room_for(int(num_spans)))
-    tile, triangle = _pairs(runs, max_pairs=room_for(int(num_pairs)), num_tiles=grid.count)
-    tile, triangle = _sorted_pairs(tile, triangle, grid.count)
+    return _pairs(runs, max_pairs=room_for(int(num_pairs)), num_tiles=grid.count)
+
+
+def bin_triangles(triangles: ScreenTriangles, grid: TileGrid, pattern: Samples) -> Work:
+    """Pairs of tile and triangle, as many as there are, sorted by tile."""
+    tile, triangle = _sorted_pairs(*tile_pairs(triangles, grid, pattern), grid.count)
     return _work_jit(triangles, tile, triangle, grid, pattern)
 
 

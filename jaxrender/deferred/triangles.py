@@ -120,6 +120,33 @@ def edge(
     return divide_by(high, low, bits=unit.bit_length() - 1), value
 
 
+def weight_steps(
+    xy: Int[Array, "*b 3 2"], area: Float[Array, "*b"], *, unit: int
+) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
+    """Steps of the corners' weights, which are linear on the screen, per `unit` snapped units to the right and down."""
+    start, end = jnp.roll(xy, -1, axis=-2), jnp.roll(xy, -2, axis=-2)
+    dx, dy = ((end - start)[..., axis].astype(area.dtype) for axis in (0, 1))
+    step = unit / area[..., None]
+    return -dy * step, dx * step
+
+
+def corner_planes(triangles: ScreenTriangles) -> list[list[Float[Array, " n"]]]:
+    """What is linear on the screen, at the three corners: window depth, 1/w, and b_1/w and b_2/w of the source."""
+    over_w = safe_div(jnp.ones_like(triangles.w), triangles.w)
+    b1, b2 = (triangles.weights[..., i] * over_w for i in (1, 2))
+    return [[values[:, k] for k in range(3)] for values in (triangles.z, over_w, b1, b2)]
+
+
+def plane_steps(triangles: ScreenTriangles, *, unit: int) -> tuple[list[Float[Array, " n"]], list[Float[Array, " n"]]]:
+    """Steps of `corner_planes` per `unit` snapped units to the right, and down."""
+    planes = corner_planes(triangles)
+    right, down = (
+        [d[:, 0] * plane[0] + d[:, 1] * plane[1] + d[:, 2] * plane[2] for plane in planes]
+        for d in weight_steps(triangles.xy, triangles.area, unit=unit)
+    )
+    return right, down
+
+
 def screen_barycentrics(
     xy: Int[Array, "*b 3 2"], area: Float[Array, "*b"], px: Int[Array, "*b"], py: Int[Array, "*b"]
 ) -> Float[Array, "*b 3"]:

@@ -42,7 +42,6 @@ EXCEPTIONS = {
     "deferred.quads.draw_overdraw": "a picture for people",
     "deferred.gbuffer.AttributeTable": "jaxrender's own way: what it gathers by sample, in rows",
     "deferred.gbuffer.attribute_table": "the same",
-    "deferred.gbuffer.plane_slopes": "the same; the twin solves for the weights",
     "deferred.gbuffer.gbuffer_rows": "jaxrender's own way: bands of an image",
     "deferred.gbuffer.with_motion": "a step of make_gbuffer, which is compared as a whole",
     "deferred.gbuffer.surface_points": "the same, for lists of fragments",
