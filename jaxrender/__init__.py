@@ -17,6 +17,7 @@ relighting), `jaxrender.pathtrace` (the CPU ray backend).
 
 from jaxrender.camera import Camera as Camera
 from jaxrender.checks import InputError as InputError
+from jaxrender.machine import avoid_wrong_sums as _avoid_wrong_sums
 from jaxrender.scene import Lights as Lights
 from jaxrender.scene import Material as Material
 from jaxrender.scene import Mesh as Mesh
@@ -26,3 +27,5 @@ from jaxrender.scene import make_mesh_sequence as make_mesh_sequence
 from jaxrender.scene import vertex_normals as vertex_normals
 
 __version__ = "0.1.0"
+
+_avoid_wrong_sums()  # before anybody makes an array

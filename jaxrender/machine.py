@@ -2,6 +2,7 @@
 
 import contextlib
 import hashlib
+import importlib.metadata
 import os
 import pathlib
 import platform
@@ -32,6 +33,19 @@ def keep_xla_to_one_thread() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_cpu_multi_thread_eigen" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
+
+
+def avoid_wrong_sums() -> None:
+    """Switches off a fusion of XLA's CPU compiler that computes wrong numbers; to be called before the first array.
+
+    jaxlib 0.10 compiles a sum over the last axis of a product with a broadcast factor, fused with other terms, to
+    something else (seen with 0.10.2: `max(dot(a, b), 0) + dot(b, b)` for shapes (1, h, w, 3) and (9, h, w, 3)). A
+    setting of the user's stays. Other versions may not know the option, and stop at options they do not know.
+    """
+    option = "xla_cpu_experimental_ynn_fusion_type"
+    flags = os.environ.get("XLA_FLAGS", "")
+    if importlib.metadata.version("jaxlib").startswith("0.10.") and option not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --{option}=".strip()
 
 
 def on_all_cores(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
