@@ -125,6 +125,16 @@ class Render(SceneView):
     """The picture; with --exr a file of the same name ending in .exr is written beside it."""
     samples: int = 4
     """Samples a pixel: 1, 2, 4, 8 or 16, all shaded."""
+    adaptive: int | None = None
+    """Adaptive supersampling at M x M samples a pixel, instead of --samples; also writes a map of the counts."""
+    method: Literal["clusters", "printed", "uniform", "full"] = "clusters"
+    """With --adaptive, which samples are shaded: unlike ones, those of the paper's metrics, --count of each, or all."""
+    count: int = 4
+    """With --method uniform: samples a pixel."""
+    budget: float | None = None
+    """With --adaptive: the share of the samples to shade, 0 to 1; the constants are scaled until it fits."""
+    psnr: float | None = None
+    """With --adaptive: how near to full supersampling to come, in dB; the constants are scaled until it is reached."""
     environment: Path | None = None
     """A lat-long .hdr or .exr map that lights the scene, beside the lights of the file."""
     model: Literal["metallic_roughness", "phong", "lambert"] = "metallic_roughness"
@@ -142,8 +152,27 @@ class Render(SceneView):
         from jaxrender.render_command import run_render
 
         self.check()
+        self.check_adaptive()
         console.enable_compilation_cache()
         run_render(self)
+
+    def check_adaptive(self) -> None:
+        """Raises ValueError, naming the option, if those of --adaptive do not fit together."""
+        dials = [name for name in ("budget", "psnr") if getattr(self, name) is not None]
+        if self.adaptive is None:
+            if dials or self.method != "clusters":
+                raise ValueError(f"--{(dials or ['method'])[0]}: expected --adaptive M beside it, got none")
+            return
+        if not 1 <= self.adaptive <= 8:
+            raise ValueError(f"--adaptive: expected a number from 1 to 8, got {self.adaptive}")
+        if dials and (len(dials) > 1 or self.method not in ("clusters", "printed")):
+            raise ValueError(f"--{dials[0]}: expected it alone, with --method clusters or printed")
+        if self.budget is not None and not 0.0 < self.budget <= 1.0:
+            raise ValueError(f"--budget: expected a share above 0 and up to 1, got {self.budget}")
+        if self.psnr is not None and not 0.0 < self.psnr <= 200.0:
+            raise ValueError(f"--psnr: expected decibels above 0 and up to 200, got {self.psnr}")
+        if self.method == "uniform" and not 1 <= self.count <= self.adaptive**2:
+            raise ValueError(f"--count: expected a number from 1 to {self.adaptive**2}, got {self.count}")
 
 
 @dataclass(frozen=True)

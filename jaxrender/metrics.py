@@ -1,7 +1,7 @@
 """How far an image or a table of numbers is from its reference, and pictures of the difference.
 
 Image metrics expect linear or display-encoded values with peak 1 and say nothing about which: name the
-encoding where you report them. All but `ssim` are pure and differentiable.
+encoding where you report them. All but `ssim` and `flip` are pure and differentiable.
 """
 
 import jax.numpy as jnp
@@ -76,6 +76,41 @@ def ssim(
             use_sample_covariance=False,
         )
     )
+
+
+def flip(
+    image: Float[Array | np.ndarray, "h w 3"],
+    reference: Float[Array | np.ndarray, "h w 3"],
+    *,
+    pixels_per_degree: float = 67.0,
+) -> float:
+    """Mean FLIP error in [0, 1]: how much an eye sees change that flips between two images; 0 for equal ones.
+
+    Unlike the other metrics it wants one encoding: sRGB, in [0, 1]. Equal for image and reference exchanged. Computed
+    by the authors' library (the extra "peers"), on the host.
+
+    Args:
+      pixels_per_degree: of the eye's field, > 0; the default is a 4k screen, 0.7 m wide and 0.7 m away.
+    Raises:
+      ValueError: if the images differ in shape, have no pixels or other than three channels.
+      ImportError: if flip-evaluator is not installed.
+    References:
+      Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild, "FLIP: A Difference Evaluator for Alternating
+      Images", HPG 2020.
+    """
+    import flip_evaluator  # an extra, and only a report needs it
+
+    checks.check_same_shape("image and reference", image, reference)
+    checks.check_last_axis("image", image, 3)
+    checks.check_at_least("image: height and width", min(image.shape[:2]), 1)
+    if not pixels_per_degree > 0.0:
+        raise ValueError(f"pixels_per_degree: expected a value > 0, got {pixels_per_degree}")
+    # Copies, since the library refuses arrays that must not be written.
+    first, second = (np.array(values, np.float32, order="C") for values in (reference, image))
+    _, mean, _ = flip_evaluator.evaluate(
+        first, second, "LDR", applyMagma=False, parameters={"ppd": float(pixels_per_degree)}
+    )
+    return float(mean)
 
 
 def heatmap(values: Float[Array, "*b"], *, low: float = 0.0, high: float | None = None) -> Float[Array, "*b 3"]:

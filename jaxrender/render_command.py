@@ -2,6 +2,8 @@
 
 import math
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -10,8 +12,12 @@ import numpy as np
 from jaxrender import console
 from jaxrender.camera import Camera
 from jaxrender.checks import bad_input
+from jaxrender.deferred.adaptive import Uniform, scene_view, shade_adaptive, supersample
+from jaxrender.deferred.clusters import Clusters
+from jaxrender.deferred.dial import fit_budget, fit_psnr
 from jaxrender.deferred.exchange import gbuffer_layers
-from jaxrender.deferred.pipeline import Rendering, render_scene, scene_textures
+from jaxrender.deferred.metrics import SampleMetrics
+from jaxrender.deferred.pipeline import Rendering, render_scene
 from jaxrender.deferred.preview import environment_background, gradient_background, lay_over
 from jaxrender.deferred.samples import standard_pattern
 from jaxrender.harmonics.light import project_environment
@@ -19,6 +25,7 @@ from jaxrender.io import load_scene, read_environment, write_exr, write_png
 from jaxrender.io.builtin_scene import builtin_scene
 from jaxrender.io.picture import tone_map
 from jaxrender.machine import is_writable_folder
+from jaxrender.metrics import heatmap
 from jaxrender.scene import Scene, inside_camera, whole_scene_camera
 
 if TYPE_CHECKING:
@@ -43,25 +50,80 @@ def run_render(options: "Render") -> None:
     light: dict[str, Any] = {}
     if environment is not None:
         light = {"lights": scene.lights, "ambient": project_environment(jnp.asarray(environment), order=5)}
-    rendering = render_scene(
-        scene, camera, height=height, width=width, samples=standard_pattern(options.samples),
-        textures=scene_textures(scene), transparency=options.transparency, model=options.model, **light,
-    )  # fmt: skip
+    draw = _draw if options.adaptive is None else _draw_adaptive
+    picture = draw(options, scene, camera, light)
     seconds = time.perf_counter() - started
-    if not rendering.alpha.any():
+    if not picture.alpha.any():
         console.announce(f"{scene.name}: nothing of it is seen")
     paths = [out]
     if environment is None:
         behind = gradient_background(height, width, top=BACKDROP_TOP, bottom=BACKDROP_BOTTOM)
     else:
         behind = environment_background(environment, camera, height=height, width=width)
-    image = lay_over(rendering.image * rendering.alpha[..., None], rendering.alpha, behind)
+    image = lay_over(picture.image * picture.alpha[..., None], picture.alpha, behind)
     write_png(out, tone_map(image, exposure_stops=options.exposure_stops))
     if options.exr:
         paths.append(out.with_suffix(".exr"))
-        write_exr(paths[-1], picture_layers(rendering))
-    record = {"triangles": len(scene.faces), "covered": float(np.mean(rendering.alpha)), "seconds": seconds}
+        write_exr(paths[-1], picture.layers())
+    if picture.count is not None:
+        paths.append(out.with_suffix(".counts.png"))
+        write_png(paths[-1], np.asarray(heatmap(jnp.asarray(picture.count, jnp.float32), high=picture.most)))
+    record = {
+        "triangles": len(scene.faces), "covered": float(np.mean(picture.alpha)), "seconds": seconds, **picture.numbers
+    }  # fmt: skip
     console.finish(paths=paths, record=record, as_json=options.json)
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """What a way of drawing gives: `layers` makes those of the EXR file; `count`, of samples a pixel, if it varies."""
+
+    image: np.ndarray
+    alpha: np.ndarray
+    layers: Callable[[], dict[str, np.ndarray]]
+    count: np.ndarray | None = None
+    most: int = 1
+    numbers: dict[str, float] = field(default_factory=dict)
+
+
+def _draw(options: "Render", scene: Scene, camera: Camera, light: dict[str, Any]) -> _Picture:
+    """Every sample of a pattern is shaded."""
+    width, height = options.size
+    rendering = render_scene(
+        scene, camera, height=height, width=width, samples=standard_pattern(options.samples),
+        transparency=options.transparency, model=options.model, **light,
+    )  # fmt: skip
+    return _Picture(rendering.image, rendering.alpha, lambda: picture_layers(rendering))
+
+
+def _draw_adaptive(options: "Render", scene: Scene, camera: Camera, light: dict[str, Any]) -> _Picture:
+    """Some of the samples of an ordered grid are shaded."""
+    width, height = options.size
+    assert options.adaptive is not None
+    samples, lighting = scene_view(
+        scene, camera, height=height, width=width, size=options.adaptive, transparency=options.transparency,
+        model=options.model, **light,
+    )  # fmt: skip
+    method: Clusters | SampleMetrics = SampleMetrics() if options.method == "printed" else Clusters()
+    if options.method == "full":
+        found = supersample(samples, lighting)
+    elif options.method == "uniform":
+        found = shade_adaptive(samples, lighting, method=Uniform(options.count))
+    elif options.budget is not None:
+        method, found = fit_budget(samples, lighting, method, budget=options.budget)
+    elif options.psnr is not None:
+        method, found = fit_psnr(samples, lighting, method, psnr_db=options.psnr)
+    else:
+        found = shade_adaptive(samples, lighting, method=method)
+    console.announce(
+        f"{100.0 * found.sample_share:.1f} % of {found.num_covered} samples shaded, scale {method.scale:g}"
+    )
+    layers = {
+        "": np.concatenate([found.image, found.alpha[..., None]], axis=-1),
+        "samplecount": found.count[..., None].astype(np.uint32),
+    }
+    numbers = {"sample_share": found.sample_share, "scale": method.scale}
+    return _Picture(found.image, found.alpha, lambda: layers, found.count, options.adaptive**2, numbers)
 
 
 def open_view(options: "SceneView") -> tuple[Scene, Camera]:

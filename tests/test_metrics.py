@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrender.metrics import heatmap, mse, psnr, relative_l2, ssim
+from jaxrender.metrics import flip, heatmap, mse, psnr, relative_l2, ssim
 
 
 def test_known_values():
@@ -44,6 +44,33 @@ def test_ssim_of_constants_is_the_luminance_term():
     a, b, c1 = 0.25, 0.75, 1e-4
     image, reference = np.full((12, 12, 1), a), np.full((12, 12, 1), b)
     assert ssim(image, reference) == pytest.approx((2 * a * b + c1) / (a * a + b * b + c1), rel=1e-9)
+
+
+def test_flip_of_equal_images_and_of_the_largest_difference(rng):
+    pytest.importorskip("flip_evaluator")
+    image = rng.random((16, 20, 3)).astype(np.float32)
+    assert flip(image, image) == flip(jnp.asarray(image), jnp.asarray(image)) == 0.0
+    # The scale's end is the difference of the primaries green and blue.
+    green, blue = (np.broadcast_to(np.eye(3, dtype=np.float32)[i], (16, 20, 3)) for i in (1, 2))
+    assert flip(green, blue) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_flip_is_symmetric_and_forgives_what_is_too_fine_to_see(rng):
+    pytest.importorskip("flip_evaluator")
+    image = 0.3 + 0.4 * rng.random((24, 32, 3)).astype(np.float32)
+    noisy = image + 0.1 * rng.standard_normal(image.shape).astype(np.float32)
+    assert flip(image, noisy) == pytest.approx(flip(noisy, image), rel=1e-5)
+    assert flip(image, noisy, pixels_per_degree=100.0) < flip(image, noisy, pixels_per_degree=10.0)
+
+
+def test_flip_checks_its_arguments():
+    pytest.importorskip("flip_evaluator")
+    with pytest.raises(ValueError, match="one shape"):
+        flip(np.zeros((4, 5, 3)), np.zeros((4, 6, 3)))
+    with pytest.raises(ValueError, match="image"):
+        flip(np.zeros((4, 5, 1)), np.zeros((4, 5, 1)))
+    with pytest.raises(ValueError, match="pixels_per_degree: expected a value > 0"):
+        flip(np.zeros((4, 5, 3)), np.zeros((4, 5, 3)), pixels_per_degree=0.0)
 
 
 @pytest.mark.parametrize("metric", [mse, psnr, relative_l2, ssim])

@@ -15,7 +15,7 @@ from jaxrender.deferred.interpolate import sample_places
 from jaxrender.deferred.raster import Fragments
 from jaxrender.deferred.texture import Textures, sample_texture_grad
 from jaxrender.deferred.triangles import SUBPIXELS, ScreenTriangles, plane_steps
-from jaxrender.scene import Scene
+from jaxrender.scene import Material, Scene
 from jaxrender.vecmath import normalize
 
 #: Samples that are interpolated at a time; what they gather stays in a processor's cache.
@@ -172,32 +172,60 @@ def surface_points(
     Returns:
       the surface there, with any leading axes, and the previous clip position, if the table has them.
     """
-    b1, b2 = barycentrics[..., :1], barycentrics[..., 1:]
+    gbuffer, tangent, previous = smooth_points(table, triangle_id, screen_id, barycentrics, w)
+    if textures is not None:
+        normal = mapped_normal(gbuffer, tangent, scene.material, textures, max_anisotropy=max_anisotropy)
+        gbuffer = dataclasses.replace(gbuffer, normal=normal)
+    return gbuffer, previous
+
+
+def smooth_points(
+    table: AttributeTable, triangle_id: Int[Array, "*b"], screen_id: Int[Array, "*b"],
+    barycentrics: Float[Array, "*b 2"], w: Float[Array, "*b"], *, shift: Float[Array, "*b 2"] | None = None,
+) -> tuple[GBuffer, Float[Array, "*b 4"], Float[Array, "*b 4"] | None]:  # fmt: skip
+    """`surface_points` before the normal map.
+
+    Args:
+      shift: (x, y) in pixels, y down: the surface is taken so far away from the point, in the plane of its triangle.
+    Returns:
+      the surface; the tangent of its side (see `mapped_normal`); the previous clip position, if the table has them.
+    """
     some, own, screen = (triangle_id >= 0)[..., None], jnp.maximum(triangle_id, 0), jnp.maximum(screen_id, 0)
+    slopes = table.slopes[screen]
+    if shift is not None:
+        barycentrics, w = _shifted(barycentrics, w, slopes, shift)
+    b1, b2 = barycentrics[..., :1], barycentrics[..., 1:]
     corner = table.corner[own]
     c = corner.shape[-1] // 3
     step_1, step_2 = corner[..., c : 2 * c], corner[..., 2 * c :]
     values = jnp.where(some, corner[..., :c] + b1 * step_1 + b2 * step_2, 0.0)
     position, normal, uv, color, tangent, previous = jnp.split(values, [3, 6, 8, 12, 16], axis=-1)
     # A = a_0 + b_1 (a_1 - a_0) + b_2 (a_2 - a_0), and db_k = w (d(b_k/w) - b_k d(1/w)).
-    slopes = table.slopes[screen]
     duv_dx, duv_dy = (
         jnp.where(some, w[..., None] * ((d[..., 1:2] - b1 * d[..., :1]) * step_1[..., 6:8]
                                         + (d[..., 2:] - b2 * d[..., :1]) * step_2[..., 6:8]), 0.0)
         for d in (slopes[..., :3], slopes[..., 3:])
     )  # fmt: skip
-    material_id = jnp.where(some[..., 0], table.material_id[own], -1)
     # The back of a surface is seen only where it has two sides; there its normals are turned over.
     side = jnp.where(some, jnp.where(table.front[screen], 1.0, -1.0)[..., None], 0.0)
-    normal = normalize(normal)
-    if textures is not None:
-        lookup = uv, duv_dx, duv_dy, max_anisotropy
-        normal = _with_normal_map(scene, textures, normal, tangent, jnp.maximum(material_id, 0), lookup)
     gbuffer = GBuffer(
-        position=position, normal=normal * side, geometric_normal=table.flat[own] * side, uv=uv, duv_dx=duv_dx,
-        duv_dy=duv_dy, color=color, depth=w, material_id=material_id, triangle_id=triangle_id,
+        position=position, normal=normalize(normal) * side, geometric_normal=table.flat[own] * side, uv=uv,
+        duv_dx=duv_dx, duv_dy=duv_dy, color=color, depth=w,
+        material_id=jnp.where(some[..., 0], table.material_id[own], -1), triangle_id=triangle_id,
     )  # fmt: skip
-    return gbuffer, previous if previous.shape[-1] else None
+    return gbuffer, tangent * side, previous if previous.shape[-1] else None
+
+
+def _shifted(
+    barycentrics: Float[Array, "*b 2"], w: Float[Array, "*b"], slopes: Float[Array, "*b 6"], shift: Float[Array, "*b 2"]
+) -> tuple[Float[Array, "*b 2"], Float[Array, "*b"]]:
+    """Barycentrics and w some way along the plane of the triangle: 1/w and b/w are linear on the screen."""
+    step = slopes[..., :3] * shift[..., :1] + slopes[..., 3:] * shift[..., 1:]
+    inverse = jnp.where(w > 0.0, 1.0 / jnp.where(w > 0.0, w, 1.0), 0.0)
+    # Beyond four times the depth the plane is as good as edge-on.
+    moved = 1.0 / jnp.where(w > 0.0, jnp.maximum(inverse + step[..., 0], 0.25 * inverse), 1.0)
+    barycentrics = (barycentrics * inverse[..., None] + step[..., 1:]) * moved[..., None]
+    return barycentrics, jnp.where(w > 0.0, moved, 0.0)
 
 
 def with_motion(
@@ -219,19 +247,29 @@ def with_motion(
     return dataclasses.replace(gbuffer, motion=jnp.where(seen[..., None], moved, 0.0))
 
 
-def _with_normal_map(
-    scene: Scene, textures: Textures, normal: Float[Array, "*b 3"], tangent: Float[Array, "*b 4"],
-    material: Int[Array, "*b"], lookup: tuple,
-) -> Float[Array, "*b 3"]:  # fmt: skip
-    """The shading normal turned by the material's normal map, where it has one."""
-    uv, duv_dx, duv_dy, max_anisotropy = lookup
-    layer = scene.material.normal_texture[material]
+def mapped_normal(
+    gbuffer: GBuffer, tangent: Float[Array, "*b 4"], material: Material, textures: Textures, *, max_anisotropy: int = 8
+) -> Float[Array, "*b 3"]:
+    """The shading normal turned by the material's normal map, where it has one.
+
+    Args:
+      tangent: direction of growing u, and 1 or -1 for the sense of the bitangent; both change sign with the side.
+    """
+    layer = material.normal_texture[jnp.maximum(gbuffer.material_id, 0)]
     texel = sample_texture_grad(
-        textures, uv, duv_dx, duv_dy, layer=jnp.maximum(layer, 0), max_anisotropy=max_anisotropy
-    )[..., :3]
-    scale = scene.material.normal_scale[material][..., None]
+        textures, gbuffer.uv, gbuffer.duv_dx, gbuffer.duv_dy, layer=jnp.maximum(layer, 0), max_anisotropy=max_anisotropy
+    )
+    return turned_normal(gbuffer, tangent, material, texel[..., :3])
+
+
+def turned_normal(
+    gbuffer: GBuffer, tangent: Float[Array, "*b 4"], material: Material, texel: Float[Array, "*b 3"]
+) -> Float[Array, "*b 3"]:
+    """`mapped_normal` for texels of the normal map that were looked up already."""
+    own, normal = jnp.maximum(gbuffer.material_id, 0), gbuffer.normal
+    scale = material.normal_scale[own][..., None]
     local = (2.0 * texel - 1.0) * jnp.concatenate([scale, scale, jnp.ones_like(scale)], axis=-1)
     t = normalize(tangent[..., :3])
     b = jnp.cross(normal, t) * tangent[..., 3:]
     turned = normalize(local[..., :1] * t + local[..., 1:2] * b + local[..., 2:] * normal)
-    return jnp.where((layer >= 0)[..., None], turned, normal)
+    return jnp.where((material.normal_texture[own] >= 0)[..., None], turned, normal)

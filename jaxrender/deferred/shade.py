@@ -5,7 +5,7 @@ everything but ids.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -63,27 +63,31 @@ def look_up_surface(
       occlusion texture is what is left of the light.
     """
     own = jnp.maximum(gbuffer.material_id, 0)
+    texels = {}
+    for slot in TEXTURE_SLOTS:
+        if textures is not None and slot in slots:
+            layer = getattr(material, slot)[own]
+            found = sample_texture_grad(
+                textures, gbuffer.uv, gbuffer.duv_dx, gbuffer.duv_dy, layer=jnp.maximum(layer, 0),
+                max_anisotropy=max_anisotropy,
+            )  # fmt: skip
+            texels[slot] = jnp.where((layer >= 0)[..., None], found, jnp.ones_like(found))
+    return surface_of_texels(gbuffer, material, texels)
 
-    def texel(slot: str) -> Float[Array, "*b 4"]:
-        if textures is None or slot not in slots:
-            return jnp.ones_like(gbuffer.color)
-        layer = getattr(material, slot)[own]
-        found = sample_texture_grad(
-            textures, gbuffer.uv, gbuffer.duv_dx, gbuffer.duv_dy, layer=jnp.maximum(layer, 0),
-            max_anisotropy=max_anisotropy,
-        )  # fmt: skip
-        return jnp.where((layer >= 0)[..., None], found, jnp.ones_like(found))
 
-    base = material.base_color[own] * texel("base_color_texture") * gbuffer.color
-    rough = texel("metallic_roughness_texture")
+def surface_of_texels(gbuffer: GBuffer, material: Material, texels: Mapping[str, Float[Array, "*b 4"]]) -> Surface:
+    """`look_up_surface` for textures that were looked up already, by slot; those that are missing are 1."""
+    own, one = jnp.maximum(gbuffer.material_id, 0), jnp.ones_like(gbuffer.color)
+    base = material.base_color[own] * texels.get("base_color_texture", one) * gbuffer.color
+    rough = texels.get("metallic_roughness_texture", one)
     strength = material.occlusion_strength[own][..., None]
     return Surface(
         base_color=base[..., :3],
         alpha=base[..., 3],
         metallic=material.metallic[own][..., None] * rough[..., 2:3],
         roughness=material.roughness[own][..., None] * rough[..., 1:2],
-        emissive=material.emissive[own] * texel("emissive_texture")[..., :3],
-        occlusion=1.0 + strength * (texel("occlusion_texture")[..., :1] - 1.0),
+        emissive=material.emissive[own] * texels.get("emissive_texture", one)[..., :3],
+        occlusion=1.0 + strength * (texels.get("occlusion_texture", one)[..., :1] - 1.0),
     )
 
 

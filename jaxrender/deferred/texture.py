@@ -40,10 +40,10 @@ class Textures:
     """All levels of all layers. Texel (x, y) of level l of layer k is `texels[offset[k, l] + y * width[k, l] + x]`.
 
     A layer with fewer levels than the deepest one repeats its last in the tables. `wrap` holds indices into
-    `WRAP_MODES`, for u and v. Texels are linear RGBA.
+    `WRAP_MODES`, for u and v. Texels are linear RGBA; lookups work with any number of channels.
     """
 
-    texels: Float[Array, "n 4"]
+    texels: Float[Array, "n c"]
     offset: Int[Array, "k l"]
     width: Int[Array, "k l"]
     height: Int[Array, "k l"]
@@ -313,7 +313,7 @@ def sample_texture_grad(
     def step(i: Array, total: Array) -> Array:
         return jax.lax.cond(jnp.any(i.astype(uv.dtype) < taps), add_tap, lambda _, total: total, i, total)
 
-    zero = jnp.zeros((*uv.shape[:-1], 4), jnp.result_type(textures.texels, uv))
+    zero = jnp.zeros((*uv.shape[:-1], textures.texels.shape[-1]), jnp.result_type(textures.texels, uv))
     # Checkpoint: going back, a tap is looked up again instead of kept.
     return jax.lax.fori_loop(0, max_anisotropy, jax.checkpoint(step), zero) / taps[..., None]
 
@@ -389,7 +389,10 @@ def sample_ewa(
         needed = distance < jnp.sqrt(jnp.max(a, initial=1.0))
         return jax.lax.cond(needed, add_row, lambda _, sums: sums, row, sums)
 
-    zero = jnp.zeros((*uv.shape[:-1], 4), jnp.result_type(textures.texels, uv)), jnp.zeros_like(a)
+    zero = (
+        jnp.zeros((*uv.shape[:-1], textures.texels.shape[-1]), jnp.result_type(textures.texels, uv)),
+        jnp.zeros_like(a),
+    )
     total, weights = jax.lax.fori_loop(0, 2 * max_radius + 4, jax.checkpoint(step), zero)
     return total / weights[..., None]
 

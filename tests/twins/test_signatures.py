@@ -19,12 +19,14 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 PAIRED = (
     "vecmath", "camera", "metrics", "scene", "brdf", "harmonics.", "animation.skeleton", "animation.skinning",
     "deferred.samples", "deferred.texture", "deferred.quads", "deferred.warps", "deferred.gbuffer", "deferred.shade",
-    "deferred.late",
+    "deferred.late", "deferred.metrics", "deferred.sampling", "deferred.clusters", "deferred.fxaa", "deferred.mlaa",
+    "deferred.sraa",
 )  # fmt: skip
 UNPAIRED_MODULES = {"harmonics.pipeline": "the order of the stages, no arithmetic"}
 
 # Public names without a partner, or with another signature.
 EXCEPTIONS = {
+    "metrics.flip": "a library's; judged in tests/test_metrics.py",
     "vecmath.constant_like": "writes out broadcasts, which torch does by itself",
     "harmonics.sh.order_of": "a detail of how jaxrender reads an array's shape",
     "harmonics.sh.bands": "a table of jaxrender's own method",
@@ -45,6 +47,14 @@ EXCEPTIONS = {
     "deferred.gbuffer.gbuffer_rows": "jaxrender's own way: bands of an image",
     "deferred.gbuffer.with_motion": "a step of make_gbuffer, which is compared as a whole",
     "deferred.gbuffer.surface_points": "the same, for lists of fragments",
+    "deferred.gbuffer.smooth_points": "the same",
+    "deferred.gbuffer.mapped_normal": "the same",
+    "deferred.gbuffer.turned_normal": "the same",
+    "deferred.shade.surface_of_texels": "a step of look_up_surface, which is compared as a whole",
+    "deferred.metrics.SampleMetrics": "settings of the pipeline",
+    "deferred.clusters.Clusters": "settings of the pipeline",
+    "deferred.clusters.is_uneven": "which windows are worth a second look; judged in tests/deferred/test_adaptive.py",
+    "deferred.sampling.window_size": "a check of shapes",
     "deferred.late.draw_late": "a driver: finds fragments and calls the shader; judged in tests/deferred",
     "harmonics.sh.triple_product_tensor": "torchref's way to the product",
     "harmonics.zh.zonal_integral": "torchref integrates where jaxrender has closed forms",
@@ -60,6 +70,27 @@ COMPARED_APART = {
     "deferred.gbuffer.make_gbuffer": "on fragments that both sides share: tests/twins/test_shading.py",
     "deferred.late.resolve": "the same",
     "deferred.quads.quad_derivatives": "on fragments that each side rasterises: tests/twins/test_quads.py",
+    "deferred.metrics.depth_sample_count": "in tests/twins/test_adaptive.py",
+    "deferred.metrics.normal_sample_count": "in tests/twins/test_adaptive.py",
+    "deferred.metrics.shading_sample_count": "in tests/twins/test_adaptive.py",
+    "deferred.metrics.shading_steps": "in tests/twins/test_adaptive.py",
+    "deferred.metrics.sample_count": "in tests/twins/test_adaptive.py",
+    "deferred.metrics.balanced_counts": "in tests/twins/test_adaptive.py",
+    "deferred.metrics.tile_maximum": "in tests/twins/test_adaptive.py",
+    "deferred.metrics.average_over_frames": "in tests/twins/test_adaptive.py",
+    "deferred.sampling.sample_positions": "in tests/twins/test_adaptive.py",
+    "deferred.sampling.sample_rank": "in tests/twins/test_adaptive.py",
+    "deferred.sampling.first_sample": "in tests/twins/test_adaptive.py",
+    "deferred.sampling.prefix_points": "in tests/twins/test_adaptive.py",
+    "deferred.sampling.cluster_points": "in tests/twins/test_adaptive.py",
+    "deferred.sampling.index_matrix": "in tests/twins/test_adaptive.py",
+    "deferred.clusters.cluster_samples": "in tests/twins/test_adaptive.py",
+    "deferred.clusters.shading_slope": "in tests/twins/test_adaptive.py",
+    "deferred.fxaa.fxaa": "in tests/twins/test_antialiasing.py",
+    "deferred.fxaa.luma": "in tests/twins/test_antialiasing.py",
+    "deferred.fxaa.luma_range": "in tests/twins/test_antialiasing.py",
+    "deferred.mlaa.mlaa": "in tests/twins/test_antialiasing.py",
+    "deferred.sraa.sraa": "in tests/twins/test_antialiasing.py",
 }
 
 

@@ -27,7 +27,7 @@ class Textures:
     Tables end by repeating the last level of a layer. `wrap`: 0 repeat, 1 clamp, 2 mirror, for u and v.
     """
 
-    texels: Float[Tensor, "n 4"]
+    texels: Float[Tensor, "n c"]
     offset: Int[Tensor, "k l"]
     width: Int[Tensor, "k l"]
     height: Int[Tensor, "k l"]
