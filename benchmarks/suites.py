@@ -16,7 +16,13 @@ from typing import Protocol, cast
 from jaxrender import checks
 
 #: Suite name -> module. Imported when it is asked for, since suites import the libraries they compare with.
-SUITES: Mapping[str, str] = MappingProxyType({"harmonics": "benchmarks.harmonics", "raster": "benchmarks.raster"})
+SUITES: Mapping[str, str] = MappingProxyType(
+    {
+        "adaptive": "benchmarks.adaptive",
+        "harmonics": "benchmarks.harmonics",
+        "raster": "benchmarks.raster",
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,10 @@ class Options:
     def wants(self, case: str) -> bool:
         """Whether `case` matches one of the asked patterns; a suite asks before it prepares a case."""
         return any(fnmatch.fnmatchcase(case, pattern) for pattern in self.cases)
+
+    def names(self, case: str) -> bool:
+        """`wants` but for the pattern "*": asked for a case that takes too long to run with all the others."""
+        return any(fnmatch.fnmatchcase(case, pattern) for pattern in self.cases if pattern != "*")
 
 
 @dataclass(frozen=True)

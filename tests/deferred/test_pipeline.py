@@ -197,8 +197,30 @@ def test_render_with_a_sky_from_inside(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("words", "share"),
+    [([], None), (["--method", "printed", "--budget", "0.6"], 0.6), (["--method", "uniform", "--count", "2"], None)],
+)
+def test_render_with_fewer_samples(tmp_path, capsys, words, share):
+    out = tmp_path / "picture.png"
+    arguments = ["--adaptive", "2", "--size", "40", "30", *words, "--exr", "--json"]
+    assert cli.main(["render", "-o", str(out), *arguments]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["paths"] == [str(out.with_suffix(end)) for end in (".png", ".exr", ".counts.png")]
+    layers = read_exr_layers(out.with_suffix(".exr"))
+    count, alpha = layers["samplecount"][..., 0], layers[""][..., 3]
+    assert count.max() <= 4 and ((count > 0) == (alpha > 0)).all()
+    assert record["sample_share"] <= (share or 1.0)
+    assert read_png(out.with_suffix(".counts.png")).shape[:2] == (30, 40)
+
+
+@pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["--budget", "0.3"], "--budget: expected --adaptive M"),
+        (["--adaptive", "9"], "--adaptive: expected a number from 1 to 8"),
+        (["--adaptive", "2", "--budget", "0.3", "--psnr", "40"], "--budget: expected it alone"),
+        (["--adaptive", "2", "--psnr", "nan"], "--psnr: expected decibels"),
+        (["--adaptive", "2", "--method", "uniform", "--count", "5"], "--count: expected a number from 1 to 4"),
         (["nowhere.gltf"], "nowhere.gltf"),
         (["--samples", "3"], "--samples: expected one of 1, 2, 4, 8, 16, got 3"),
         (["--size", "0", "4"], "--size"),

@@ -121,7 +121,7 @@ def test_a_model_that_does_not_fit_is_refused_in_one_line(run, tmp_path, capsys,
 
 
 def test_the_readme_examples_run_as_printed(run, monkeypatch):
-    relit, raster, whole = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
+    relit, raster, whole, adaptive = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
     monkeypatch.chdir(run)
     names: dict = {}
     exec(raster, names)
@@ -131,6 +131,9 @@ def test_the_readme_examples_run_as_printed(run, monkeypatch):
     exec(whole.replace('{"height": 768, "width": 1024}', '{"height": 36, "width": 48}'), names)
     assert names["picture"].shape == (36, 48, 3) and names["picture"].max() > 0.05
     assert read_exr(run / "gbuffer.exr", layer="normal").shape == (36, 48, 3)
+    exec(adaptive, names)
+    assert names["picture"].image.shape == names["next_frame"].image.shape == (36, 48, 3)
+    assert names["picture"].sample_share <= 0.2
     exec(relit, names)
     positions, colors = np.asarray(names["positions"]), np.asarray(names["colors"])
     assert positions.shape == colors.shape == (3273, 3)
