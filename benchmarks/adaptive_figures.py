@@ -237,7 +237,7 @@ def _crop(view: View) -> tuple[int, tuple[int, int]]:
 
 
 def worst_places(error: Float[np.ndarray, "h w"], height: int, width: int, *, number: int) -> list[tuple[int, int]]:
-    """Upper left corners of windows that do not overlap, with the largest mean error first."""
+    """Upper left corners of windows at least as far apart as they are large, with the largest mean error first."""
     mean = uniform_filter(np.asarray(error, np.float64), (height, width), mode="constant")
     top, left = height // 2, width // 2
     mean = mean[top : top + error.shape[0] - height + 1, left : left + error.shape[1] - width + 1]
@@ -245,7 +245,7 @@ def worst_places(error: Float[np.ndarray, "h w"], height: int, width: int, *, nu
     for _ in range(number):
         y, x = (int(i) for i in np.unravel_index(np.argmax(mean), mean.shape))
         found.append((y, x))
-        mean[max(0, y - height + 1) : y + height, max(0, x - width + 1) : x + width] = -1.0
+        mean[max(0, y - 2 * height + 1) : y + 2 * height, max(0, x - 2 * width + 1) : x + 2 * width] = -1.0
     return found
 
 
@@ -253,7 +253,7 @@ def _outlined(image: Float[np.ndarray, "h w 3"], corners: Sequence[tuple[int, in
     picture = PIL.Image.fromarray(_bytes(image))
     draw = PIL.ImageDraw.Draw(picture)
     for (y, x), outline in zip(corners, OUTLINES, strict=True):
-        draw.rectangle((x, y, x + width - 1, y + height - 1), outline=outline)
+        draw.rectangle((x - 2, y - 2, x + width + 1, y + height + 1), outline=outline, width=2)
     return np.asarray(picture)
 
 

@@ -59,6 +59,9 @@ class Uniform:
 
 Method = Clusters | SampleMetrics | Uniform
 
+#: Sub-samples of a window are numbered in bytes.
+_LARGEST_SIZE = 11
+
 CLUSTERS = Clusters()
 
 
@@ -103,7 +106,7 @@ def render_adaptive(
     """Renders a scene at m x m samples a pixel, of which only some are shaded.
 
     Args:
-      size: m.
+      size: m, up to 11.
       method: which ones. `Clusters` (the default), the printed `SampleMetrics`, or `Uniform`.
       strategy: of `shade_adaptive`.
       options: textures, lights, ambient, max_anisotropy, transparency and model, as in `render_scene`.
@@ -121,6 +124,7 @@ def scene_view(
     """Rasterises a scene: its sub-samples, and what shading them needs. Arguments as in `render_scene`."""
     check_at_least("height", height, 1)
     check_at_least("width", width, 1)
+    _check_size(size)
     grid = ordered_grid(size)
     textures = scene_material_textures(scene) if textures is None else textures
     if lights is None and ambient is None and not len(scene.lights.kind):
@@ -138,9 +142,15 @@ def scene_view(
 
 def gbuffer_view(gbuffer: GBuffer, material: Material, *, size: int) -> GBufferSamples:
     """The sub-samples of a G-buffer: one with m x m samples a pixel, or one of m times the picture's size."""
+    _check_size(size)
     if gbuffer.depth.shape[-1] != size * size:
         gbuffer = group_samples(gbuffer, size=size)
     return GBufferSamples(material=material, gbuffer=gbuffer)
+
+
+def _check_size(size: int) -> None:
+    if not 1 <= size <= _LARGEST_SIZE:
+        raise ValueError(f"size: expected a number from 1 to {_LARGEST_SIZE}, got {size}")
 
 
 def supersample(samples: SubSamples, lighting: Lighting) -> AdaptiveImage:

@@ -116,7 +116,8 @@ def test_strategies_shade_the_same_picture(rows):
 
 @pytest.mark.slow
 def test_dial_and_flicker(rows):
-    dial = [row for row in of(rows, "dial") if row.params["view"] == "A" and row.variant == "adaptive"]
+    first = {"view": "A", "normal_maps": True}
+    dial = [row for row in of(rows, "dial") if row.variant == "adaptive" and first.items() <= row.params.items()]
     assert [row.params.get("scale") for row in dial] == [*TINY.dial, None]
     shares = [row.metrics["sample_share"] for row in dial[:-1]]
     assert shares == sorted(shares) and dial[-1].params["goal_db"] == suite.PAPER_DB[2]
@@ -189,14 +190,14 @@ def test_restlessness_is_of_second_differences():
     assert suite._restlessness(blinking) == pytest.approx(2.0)
 
 
-def test_worst_places_do_not_overlap():
+def test_worst_places_lie_apart():
     error = np.zeros((20, 30))
     error[3:6, 4:8], error[12:15, 20:24] = 1.0, 2.0
     first, second, third = figures.worst_places(error, 5, 6, number=3)
     for (y, x), (top, left) in ((first, (12, 20)), (second, (3, 4))):
         assert y <= top and top + 3 <= y + 5 and x <= left and left + 4 <= x + 6
     for a, b in ((first, second), (first, third), (second, third)):
-        assert abs(a[0] - b[0]) >= 5 or abs(a[1] - b[1]) >= 6
+        assert abs(a[0] - b[0]) >= 10 or abs(a[1] - b[1]) >= 12
     for y, x in (first, second, third):
         assert 0 <= y <= 15 and 0 <= x <= 24
 
