@@ -97,8 +97,8 @@ def refine(unknown: Unknown, fragments: Fragments, target, seen, prior, weight) 
         image = jnp.where(seen[..., None], draw(guess, fragments) - target, 0.0)
         return image, weight * (guess.texture - prior)
 
-    # Conjugate gradients on the normal equations: hundreds of texels need no dense matrix.
-    linear = lineax.Normal(lineax.CG(rtol=1e-5, atol=1e-7, max_steps=500))
+    # LSMR needs products with J and its transpose alone, no dense matrix, and keeps its footing in float32.
+    linear = lineax.LSMR(rtol=1e-5, atol=1e-5, max_steps=500)
     solver = optimistix.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=linear)
     return optimistix.least_squares(residuals, solver, unknown, max_steps=3, throw=False).value
 
