@@ -42,15 +42,16 @@ from benchmarks.suites import Measurement, Options
 from benchmarks.timing import measure_alternating
 from jaxrender import console
 from jaxrender.camera import Camera
-from jaxrender.deferred.adaptive import AdaptiveImage, Method, Uniform, scene_view, shade_adaptive, supersample
+from jaxrender.deferred.adaptive import Method, Uniform, scene_view, shade_adaptive, supersample
 from jaxrender.deferred.bands import band_starts, in_bands
+from jaxrender.deferred.canvas import AdaptiveImage
 from jaxrender.deferred.clusters import Clusters
 from jaxrender.deferred.fxaa import fxaa
 from jaxrender.deferred.metrics import SampleMetrics, balanced_counts
 from jaxrender.deferred.mlaa import mlaa
 from jaxrender.deferred.pipeline import scene_material_textures
 from jaxrender.deferred.point_shading import Lighting
-from jaxrender.deferred.sampling import first_sample
+from jaxrender.deferred.sampling import first_sample, window_size
 from jaxrender.deferred.sraa import sraa
 from jaxrender.deferred.strategies import STRATEGIES, work_order
 from jaxrender.deferred.subsamples import SubSamples
@@ -281,7 +282,7 @@ def _uniformly(samples: SubSamples, lighting: Lighting, shots: Shots) -> Shot:
     """With the balanced count that is nearest to what the printed metrics shaded."""
     n = samples.depth.shape[-1]
     wanted = n * shots["printed"].num_shaded / max(shots["printed"].num_covered, 1)
-    count = min(balanced_counts(round(n**0.5))[:-1], key=lambda k: abs(k - wanted))
+    count = min(balanced_counts(window_size(n))[:-1], key=lambda k: abs(k - wanted))
     return show(shade_adaptive(samples, lighting, method=Uniform(count)))
 
 
@@ -290,7 +291,7 @@ def _reconstructed(samples: SubSamples, lighting: Lighting, shots: Shots) -> Sho
     height, width, n = samples.depth.shape
     drawn = shade_adaptive(samples, lighting, method=Uniform(1))
     band = min(height, max(1, (1 << 17) // (width * n)))
-    rows = functools.partial(_sraa_rows, samples, drawn.image, num_rows=band, size=round(n**0.5))
+    rows = functools.partial(_sraa_rows, samples, drawn.image, num_rows=band, size=window_size(n))
     image = in_bands(lambda start: rows(np.int32(start)), band_starts(height, band), height=height)
     return show(dataclasses.replace(drawn, image=image))
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrender import checks, vecmath
+from jaxrender.srgb import decode_srgb
 
 # The colors of "inferno" at equal steps (Smith and van der Walt, 2015, CC0), as sRGB bytes: dark to bright
 # with steady lightness, so a heat map still reads when printed in gray.
@@ -126,6 +127,6 @@ def heatmap(values: Float[Array, "*b"], *, low: float = 0.0, high: float | None 
     colors = jnp.asarray(_INFERNO, values.dtype) / 255.0
     nodes = jnp.linspace(0.0, 1.0, len(_INFERNO), dtype=values.dtype)
     srgb = jnp.stack([jnp.interp(t, nodes, colors[:, c]) for c in range(3)], axis=-1)
-    linear = jnp.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    linear = decode_srgb(srgb)
     green = jnp.broadcast_to(jnp.asarray([0.0, 1.0, 0.0], values.dtype), linear.shape)
     return jnp.where(lost[..., None], green, linear)

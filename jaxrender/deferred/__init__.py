@@ -1,6 +1,5 @@
 """Deferred rendering, with the semantics of a graphics pipeline as tensors: scene -> raster -> G-buffer -> shading."""
 
-from jaxrender.deferred.adaptive import AdaptiveImage as AdaptiveImage
 from jaxrender.deferred.adaptive import Uniform as Uniform
 from jaxrender.deferred.adaptive import gbuffer_view as gbuffer_view
 from jaxrender.deferred.adaptive import render_adaptive as render_adaptive
@@ -9,7 +8,10 @@ from jaxrender.deferred.adaptive import scene_view as scene_view
 from jaxrender.deferred.adaptive import shade_adaptive as shade_adaptive
 from jaxrender.deferred.adaptive import supersample as supersample
 from jaxrender.deferred.adaptive_within import shade_adaptive_within as shade_adaptive_within
+from jaxrender.deferred.by_quads import QuadBudget as QuadBudget
+from jaxrender.deferred.canvas import AdaptiveImage as AdaptiveImage
 from jaxrender.deferred.clusters import Clusters as Clusters
+from jaxrender.deferred.clusters import cluster_quads as cluster_quads
 from jaxrender.deferred.clusters import cluster_samples as cluster_samples
 from jaxrender.deferred.dial import fit_budget as fit_budget
 from jaxrender.deferred.dial import fit_psnr as fit_psnr
@@ -20,6 +22,7 @@ from jaxrender.deferred.fxaa import fxaa as fxaa
 from jaxrender.deferred.fxaa import luma as luma
 from jaxrender.deferred.gbuffer import GBuffer as GBuffer
 from jaxrender.deferred.gbuffer import make_gbuffer as make_gbuffer
+from jaxrender.deferred.highlights import highlight_sample_count as highlight_sample_count
 from jaxrender.deferred.interpolate import attribute_gradients as attribute_gradients
 from jaxrender.deferred.interpolate import blend as blend
 from jaxrender.deferred.interpolate import centroids as centroids
@@ -40,6 +43,7 @@ from jaxrender.deferred.metrics import SampleMetrics as SampleMetrics
 from jaxrender.deferred.metrics import average_over_frames as average_over_frames
 from jaxrender.deferred.metrics import balanced_counts as balanced_counts
 from jaxrender.deferred.metrics import depth_sample_count as depth_sample_count
+from jaxrender.deferred.metrics import normal_cone as normal_cone
 from jaxrender.deferred.metrics import normal_sample_count as normal_sample_count
 from jaxrender.deferred.metrics import sample_count as sample_count
 from jaxrender.deferred.metrics import shading_sample_count as shading_sample_count

@@ -46,7 +46,7 @@ def shade_adaptive_within(
     whole = jnp.where(covered, first_sample(covered)[:, None], -1)
     owner = jnp.where(fixed.one_surface.reshape(-1, 1), whole, owner)
     image, detail = jax.lax.stop_gradient(_resolved(fixed, lighting, owner, capacity))
-    light = luma(jnp.asarray(encode_srgb(image.reshape(height, width, 3))))
+    light = luma(encode_srgb(image.reshape(height, width, 3)))
     steps = shading_steps(light, covered=covered.any(axis=-1).reshape(height, width))
     slope = shading_slope(
         steps.reshape(-1, 2), detail, light.reshape(-1), contrast_scale=method.contrast * method.scale,
@@ -80,8 +80,8 @@ def _resolved(
     points = cluster_points(owners, sample)
     place = jnp.minimum(place, num_pixels * n - 1)
     alone = jnp.sum(owners == sample[:, None], axis=-1) == 1
-    exact, _ = shade_points(samples, lighting, place, points)
-    wide, detail = shade_points(samples, lighting, place, points, taps=TAPS)
+    exact, *_ = shade_points(samples, lighting, place, points)
+    wide, detail, _ = shade_points(samples, lighting, place, points, taps=TAPS)
     radiance = jnp.where(alone[:, None], exact, wide) * points.weight[:, None]
     values = jnp.concatenate([radiance, (jnp.where(alone, 0.0, detail) * points.weight)[:, None]], axis=-1)
     sums = jax.ops.segment_sum(jnp.where(used[:, None], values, 0.0), pixel, num_segments=num_pixels)

@@ -63,9 +63,7 @@ def cluster_samples(
       normal_scale, plane_scale: of `Clusters`, times its `scale`.
     """
     check_same_shape("normal and position", normal, position)
-    window_size(covered.shape[-1])
-    n = covered.shape[-1]
-    x, y = (jnp.broadcast_to(jnp.asarray(v, depth.dtype), depth.shape) for v in sample_positions(round(n**0.5)).T)
+    x, y = _places(depth)
     features = _Features(
         normal=_parts(normal), position=_parts(position), nearness=1.0 / jnp.where(depth > 0.0, depth, 1.0),
         material_id=material_id, place=(slope[..., :1] * x, slope[..., 1:] * y), normal_scale=normal_scale,
@@ -74,20 +72,71 @@ def cluster_samples(
     first = first_sample(covered)
     nearest = jnp.where(covered, _unlike(features, first), -1.0)
     owner = jnp.broadcast_to(first[..., None], covered.shape)
+    return _grown(features, covered, nearest, owner, turns=covered.shape[-1] - 1, tolerance=1.0)
+
+
+def cluster_quads(
+    normal: Float[Array, "*b q 3"],
+    position: Float[Array, "*b q 3"],
+    depth: Float[Array, "*b q"],
+    material_id: Int[Array, "*b q"],
+    covered: Bool[Array, "*b q"],
+    seeds: Int[Array, "*b 4"],
+    *,
+    count: int,
+    normal_scale: float | Float[Array, ""],
+    plane_scale: float | Float[Array, ""],
+    apart_scale: float | Float[Array, ""],
+) -> Int[Array, "*b q"]:
+    """`cluster_samples` of q = 2m x 2m sub-samples of 2 x 2 pixels: until `count` are taken, whatever is left.
+
+    Args:
+      seeds: sub-samples that are taken first, one of each pixel; -1 for a pixel without.
+      count: at least 4.
+      normal_scale, plane_scale, apart_scale: of `QuadBudget`.
+    """
+    check_same_shape("normal and position", normal, position)
+    x, y = _places(depth)
+    features = _Features(
+        normal=_parts(normal), position=_parts(position), nearness=1.0 / jnp.where(depth > 0.0, depth, 1.0),
+        material_id=material_id, place=(2.0 * apart_scale * x, 2.0 * apart_scale * y), normal_scale=normal_scale,
+        plane_scale=plane_scale,
+    )  # fmt: skip
+    # Infinity is what another material has, and must not keep a sub-sample from belonging to anyone.
+    nearest, owner = jnp.where(covered, jnp.inf, -1.0), jnp.broadcast_to(jnp.max(seeds, -1, keepdims=True), depth.shape)
+    for k in range(seeds.shape[-1]):
+        seed = seeds[..., k]
+        unlike = jnp.where((seed >= 0)[..., None], _unlike(features, jnp.maximum(seed, 0)), jnp.inf)
+        owner = jnp.where(unlike < nearest, seed[..., None], owner)
+        nearest = jnp.minimum(nearest, unlike)
+    return _grown(features, covered, nearest, owner, turns=count - seeds.shape[-1], tolerance=0.0)
+
+
+def _grown(
+    features: "_Features", covered: Bool[Array, "*b n"], nearest: Float[Array, "*b n"], owner: Int[Array, "*b n"], *,
+    turns: int, tolerance: float,
+) -> Int[Array, "*b n"]:  # fmt: skip
+    """Takes the sub-sample that is farthest from all owners, again and again while it is beyond the tolerance."""
 
     def unfinished(state) -> Bool[Array, ""]:
         nearest, _, turn = state
-        return (turn < n) & jnp.any(nearest > 1.0)
+        return (turn < turns) & jnp.any(nearest > tolerance)
 
     def take(state):
         nearest, owner, turn = state
         farthest = jnp.argmax(nearest, axis=-1).astype(jnp.int32)
         unlike = _unlike(features, farthest)
-        won = (unlike < nearest) & (jnp.max(nearest, axis=-1, keepdims=True) > 1.0)
+        won = (unlike < nearest) & (jnp.max(nearest, axis=-1, keepdims=True) > tolerance)
         return jnp.where(won, unlike, nearest), jnp.where(won, farthest[..., None], owner), turn + 1
 
-    _, owner, _ = jax.lax.while_loop(unfinished, take, (nearest, owner, 1))
+    _, owner, _ = jax.lax.while_loop(unfinished, take, (nearest, owner, 0))
     return jnp.where(covered, owner, -1)
+
+
+def _places(depth: Float[Array, "*b n"]) -> Vector:
+    """x and y of the sub-samples, as shares of the window."""
+    x, y = sample_positions(window_size(depth.shape[-1])).T
+    return tuple(jnp.broadcast_to(jnp.asarray(v, depth.dtype), depth.shape) for v in (x, y))
 
 
 def shading_slope(

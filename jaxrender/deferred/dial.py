@@ -4,18 +4,19 @@ Found by bisection on one picture; the constants then serve the film.
 """
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import NoReturn, TypeVar
 
-import numpy as np
+import jax.numpy as jnp
 
 from jaxrender.checks import bad_input
-from jaxrender.deferred.adaptive import AdaptiveImage, shade_adaptive, supersample
+from jaxrender.deferred.adaptive import shade_adaptive, supersample
+from jaxrender.deferred.canvas import AdaptiveImage
 from jaxrender.deferred.clusters import Clusters
 from jaxrender.deferred.metrics import SampleMetrics
 from jaxrender.deferred.point_shading import Lighting
 from jaxrender.deferred.subsamples import SubSamples
+from jaxrender.metrics import psnr
 from jaxrender.srgb import encode_srgb
 
 Scalable = TypeVar("Scalable", bound=Clusters | SampleMetrics)
@@ -97,6 +98,5 @@ def _search(
 
 def picture_psnr(picture: AdaptiveImage, reference: AdaptiveImage) -> float:
     """Peak signal-to-noise ratio in dB, peak 1, of display-encoded colors over black; infinite for equal pictures."""
-    shown = [encode_srgb(np.float64(p.image) * p.alpha[..., None]) for p in (picture, reference)]
-    error = float(np.mean((shown[0] - shown[1]) ** 2))
-    return math.inf if error == 0.0 else -10.0 * math.log10(error)
+    shown = [encode_srgb(p.image * p.alpha[..., None]) for p in (picture, reference)]
+    return float(psnr(*(jnp.asarray(image, jnp.float32) for image in shown)))

@@ -102,6 +102,11 @@ def attribute_table(
     )
 
 
+def rows_per_band(height: int, samples_per_row: int, *, times: int = 1) -> int:
+    """Rows of an image that are interpolated at a time: `SAMPLES_PER_BAND` samples, or some times as many."""
+    return min(max(1, times * SAMPLES_PER_BAND // samples_per_row), height)
+
+
 def make_gbuffer(
     scene: Scene,
     fragments: Fragments,
@@ -122,7 +127,7 @@ def make_gbuffer(
     h, w, s = fragments.triangle_id.shape
     if not fragments.triangle_id.size:
         return gbuffer_rows(scene, table, fragments, 0, num_rows=h)
-    band = min(max(1, SAMPLES_PER_BAND // (w * s)), h)
+    band = rows_per_band(h, w * s)
     starts = jnp.arange(-(-h // band), dtype=jnp.int32) * band
     interpolated = jax.lax.map(
         lambda start: gbuffer_rows(

@@ -29,15 +29,18 @@ BALANCED = {1: (1,), 2: (1, 2, 4), 3: (1, 5, 9), 4: (1, 2, 6, 8, 10, 14, 16)}
 
 @dataclass(frozen=True)
 class SampleMetrics:
-    """Settings of the printed metrics. A scale of None switches a metric off.
+    """Settings of the printed metrics, and of some others that are off. A scale of None switches a metric off.
 
     Attributes:
       depth: c of k_d, for depths in [0, 1] of the farthest one.
       normal: c of k_n. shading: c of k_s, for display-encoded luma in [0, 1].
       edge_threshold, min_threshold: of k_s.
+      highlight: c of k_h (`highlight_sample_count`); off unless set.
       plane_corrected: of `depth_sample_count`.
+      mapped_normals: k_n sees normal maps, which are looked up for all sub-samples then.
       balanced: counts are rounded up to `balanced_counts`.
-      scale: multiplies all three constants; the dial.
+      least: no pixel gets fewer samples.
+      scale: multiplies all constants of metrics; the dial.
     """
 
     depth: float | None = 1000.0
@@ -45,8 +48,11 @@ class SampleMetrics:
     shading: float | None = 48.0
     edge_threshold: float = 1 / 4
     min_threshold: float = 1 / 12
+    highlight: float | None = None
     plane_corrected: bool = False
+    mapped_normals: bool = False
     balanced: bool = False
+    least: int = 1
     scale: float = 1.0
 
 
@@ -86,6 +92,18 @@ def normal_sample_count(
       normal: unit. scale: c >= 0.
       covered: as in `depth_sample_count`.
     """
+    _, chord = normal_cone(normal, covered)
+    return scale * safe_sqrt(chord)
+
+
+def normal_cone(
+    normal: Float[Array, "*b n 3"], covered: Bool[Array, "*b n"] | None = None
+) -> tuple[Float[Array, "*b 3"], Float[Array, "*b"]]:
+    """The normalised mean normal n̄, and 1 - min |n̄ · n_ij|, in [0, 1].
+
+    Where normals cancel out the latter is 1; with fewer than two covered sub-samples, or normals that are not finite,
+    it is 0.
+    """
     check_last_axis("normal", normal, 3)
     covered = _mask(normal[..., 0], covered)
     count = jnp.maximum(jnp.sum(covered, axis=-1), 1).astype(normal.dtype)
@@ -99,12 +117,11 @@ def normal_sample_count(
     apart = jnp.minimum(_distance2(normal, axis), _distance2(normal, -axis))
     chord = jnp.where(cosine > 0.5, 0.5 * apart, 1.0 - cosine)
     widest = jnp.max(jnp.where(covered, chord, 0.0), axis=-1)
-    several = jnp.sum(covered, axis=-1) > 1
     # Equal normals differ from their mean by rounding, which must not have a slope.
     widest = jnp.where(widest > 32.0 * jnp.finfo(normal.dtype).eps ** 2, widest, 0.0)
-    count = jnp.where(cancelled, 1.0, safe_sqrt(jnp.clip(widest, 0.0, 1.0)))
-    finite = jnp.all(jnp.isfinite(normal), axis=(-2, -1))
-    return jnp.where(several & finite, scale * count, 0.0)
+    widest = jnp.where(cancelled, 1.0, jnp.clip(widest, 0.0, 1.0))
+    told = (jnp.sum(covered, axis=-1) > 1) & jnp.all(jnp.isfinite(normal), axis=(-2, -1))
+    return axis, jnp.where(told, widest, 0.0)
 
 
 def _distance2(a: Float[Array, "*b n 3"], axis: Float[Array, "*b 3"]) -> Float[Array, "*b n"]:

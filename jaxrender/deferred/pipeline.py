@@ -14,12 +14,12 @@ from jaxrender.deferred.bands import band_starts, in_bands
 from jaxrender.deferred.cutouts import bleed_colors
 from jaxrender.deferred.gbuffer import (
     POINT_FIELDS,
-    SAMPLES_PER_BAND,
     AttributeTable,
     GBuffer,
     attribute_table,
     gbuffer_rows,
     make_gbuffer,
+    rows_per_band,
     smooth_points,
     surface_points,
     with_motion,
@@ -69,6 +69,15 @@ def default_lights() -> tuple[Lights, Float[Array, "3 9"]]:
     # Order 3: a constant, and band 1 along y (index 1, with the sign of the basis).
     constant, up = jnp.asarray([0.75, 0.8, 0.9], dtype), jnp.asarray([0.12, 0.18, 0.3], dtype)
     return lights, zero.at[:, 0].set(3.5449 * 0.6 * constant).at[:, 1].set(-2.0467 * up)
+
+
+def scene_lights(
+    scene: Scene, lights: Lights | None, ambient: Float[Array, "3 k"] | None
+) -> tuple[Lights, Float[Array, "3 k"] | None]:
+    """The lights that are given, else the scene's, else `default_lights`."""
+    if lights is None and ambient is None and not len(scene.lights.kind):
+        return default_lights()
+    return scene.lights if lights is None else lights, ambient
 
 
 def clip_positions(scene: Scene, camera: Camera, *, height: int, width: int) -> Float[Array, "v 4"]:
@@ -189,16 +198,14 @@ def render_scene(
     check_at_least("height", height, 1)
     check_at_least("width", width, 1)
     textures = scene_material_textures(scene) if textures is None else textures
-    if lights is None and ambient is None and not len(scene.lights.kind):
-        lights, ambient = default_lights()
-    lights = scene.lights if lights is None else lights
+    lights, ambient = scene_lights(scene, lights, ambient)
     fragments = see(
         scene, camera, height=height, width=width, samples=samples, textures=textures, transparency=transparency
     )
     table = scene_table(scene, fragments.triangles, previous_clip, grid=samples.grid)
-    band = min(
-        max(1, SAMPLES_PER_BAND // (width * samples.count), round((SAMPLES_PER_BLOCK / samples.count) ** 0.5)), height
-    )
+    # At least as many rows as a square block of samples has.
+    square = min(round((SAMPLES_PER_BLOCK / samples.count) ** 0.5), height)
+    band = max(rows_per_band(height, width * samples.count), square)
     rows = functools.partial(
         _shaded_rows, scene, table, fragments, textures, lights, ambient, camera.eye, num_rows=band,
         max_anisotropy=max_anisotropy, slots=material_slots(scene.material), model=model,
@@ -258,7 +265,7 @@ def draw_gbuffer(
     if not fragments.triangle_id.size:
         return make_gbuffer(scene, fragments, previous_clip=previous_clip)
     table = scene_table(scene, fragments.triangles, previous_clip, grid=fragments.samples.grid)
-    band = min(max(1, 2 * SAMPLES_PER_BAND // (width * num_samples)), height)
+    band = rows_per_band(height, width * num_samples, times=2)
     rows = functools.partial(
         _gbuffer_rows, scene, table, fragments, num_rows=band, textures=textures, max_anisotropy=max_anisotropy
     )

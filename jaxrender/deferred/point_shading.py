@@ -46,8 +46,8 @@ class Lighting:
 
 def shade_points(
     samples: SubSamples, lighting: Lighting, place: Int[Array, " b"], points: ShadingPoints, *, taps: int = 1
-) -> tuple[Float[Array, "b 3"], Float[Array, " b"]]:
-    """Radiance at sub-samples, and how much the material varies over what they stand for (0 with one tap).
+) -> tuple[Float[Array, "b 3"], Float[Array, " b"], Float[Array, " b"]]:
+    """Radiance at sub-samples, how much the material varies over what they stand for (0 with one tap), and roughness.
 
     Args:
       place: of the sub-samples in the image (h, w, n), counted through.
@@ -63,11 +63,12 @@ def shade_points(
     mean = lambda values: jnp.mean(values, axis=1)  # noqa: E731
     smooth = jax.tree.map(lambda values: values[:, 0], gbuffer)
     smooth = dataclasses.replace(smooth, normal=normalize(mean(normal)) if taps > 1 else normal[:, 0])
+    surface = jax.tree.map(mean, surface)
     radiance = shade(
-        smooth, jax.tree.map(mean, surface), lighting.lights, lighting.eye, ambient=lighting.ambient,
+        smooth, surface, lighting.lights, lighting.eye, ambient=lighting.ambient,
         model=lighting.model,
     )  # fmt: skip
-    return radiance, detail
+    return radiance, detail, surface.roughness[:, 0]
 
 
 def material_detail(surface: Surface, normal: Float[Array, "b t 3"]) -> Float[Array, " b"]:

@@ -27,7 +27,7 @@ def work_order(
       count: >= 0, of pixels in an order in which each 32 lie together on the screen.
       strategy: "compacted" lists all samples without a gap. "masked" loops over the pixels of a warp until the largest
         count is done. "sorted" does so after sorting the pixels by count. "per_count" makes one pass over the pixels of
-        each count, as a stencil test would. "low_resolution" is "masked"; its counts have to be made with
+        each count, as a stencil test would, from buckets. "low_resolution" is "masked"; its counts have to be made with
         `tile_maximum`.
     """
     check_one_of("strategy", strategy, STRATEGIES)
@@ -35,8 +35,9 @@ def work_order(
     if strategy == "compacted":
         return np.repeat(pixels, count), _turns(count)
     if strategy == "per_count":
-        passes = [_loops(pixels[count == k], count) for k in np.unique(count[count > 0])]
-        passes = passes or [_loops(pixels[:0], count)]
+        # Histogram bucketing: a histogram tells where each count's bucket ends, one stable sort fills them all.
+        buckets = np.split(np.argsort(count, kind="stable").astype(np.int32), np.cumsum(np.bincount(count)))
+        passes = [_loops(bucket, count) for bucket in buckets]
         return np.concatenate([pixel for pixel, _ in passes]), np.concatenate([turn for _, turn in passes])
     if strategy == "sorted":
         pixels = np.argsort(-count, kind="stable").astype(np.int32)

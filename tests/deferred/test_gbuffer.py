@@ -18,7 +18,6 @@ from jaxrender.deferred import (
     gbuffer_from_layers,
     make_gbuffer,
     ordered_grid,
-    pipeline,
     raster,
     rasterize,
     rasterize_triangles,
@@ -49,7 +48,6 @@ def test_strips_and_bands_do_not_show(scene, samples, monkeypatch):
     whole = see(scene, camera, **SIZE, samples=samples)
     one = draw_gbuffer(scene, whole, textures=textures)
     monkeypatch.setattr(raster, "TILES_PER_STRIP", 8)
-    monkeypatch.setattr(pipeline, "SAMPLES_PER_BAND", 61 * samples.count * 2)
     monkeypatch.setattr(gbuffer_module, "SAMPLES_PER_BAND", 61 * samples.count * 7)
     pieces = see(scene, camera, **SIZE, samples=samples)
     for name in FIELDS:
