@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchref._precision import in_float64
+from torchref._srgb import decode_srgb
 from torchref.vecmath import safe_div, safe_sqrt
 
 # "inferno" (Smith and van der Walt, 2015, CC0) at 0, 0.1, ..., 1, as in the published table of 256 sRGB colors.
@@ -98,6 +99,6 @@ def heatmap(values: Float[Tensor, "*b"], *, low: float = 0.0, high: float | None
     srgb = 0.0
     for node, color in enumerate(nodes):
         srgb = srgb + (1.0 - (place - node).abs()).clamp(min=0.0)[..., None] * color
-    linear = torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    linear = decode_srgb(srgb)
     green = torch.tensor([0.0, 1.0, 0.0], dtype=values.dtype, device=values.device)
     return torch.where(lost[..., None], green, linear)

@@ -37,10 +37,10 @@ class Clusters:
       scale: multiplies them all; the dial.
     """
 
-    normal: float = 8.0
-    plane: float = 300.0
-    contrast: float = 18.0
-    detail: float = 72.0
+    normal: float = 9.0
+    plane: float = 2400.0
+    contrast: float = 7.5
+    detail: float = 34.0
     scale: float = 1.0
 
 
@@ -63,12 +63,7 @@ def cluster_samples(
       normal_scale, plane_scale: of `Clusters`, times its `scale`.
     """
     check_same_shape("normal and position", normal, position)
-    x, y = _places(depth)
-    features = _Features(
-        normal=_parts(normal), position=_parts(position), nearness=1.0 / jnp.where(depth > 0.0, depth, 1.0),
-        material_id=material_id, place=(slope[..., :1] * x, slope[..., 1:] * y), normal_scale=normal_scale,
-        plane_scale=plane_scale,
-    )  # fmt: skip
+    features = _features(normal, position, depth, material_id, slope, normal_scale, plane_scale)
     first = first_sample(covered)
     nearest = jnp.where(covered, _unlike(features, first), -1.0)
     owner = jnp.broadcast_to(first[..., None], covered.shape)
@@ -96,18 +91,15 @@ def cluster_quads(
       normal_scale, plane_scale, apart_scale: of `QuadBudget`.
     """
     check_same_shape("normal and position", normal, position)
-    x, y = _places(depth)
-    features = _Features(
-        normal=_parts(normal), position=_parts(position), nearness=1.0 / jnp.where(depth > 0.0, depth, 1.0),
-        material_id=material_id, place=(2.0 * apart_scale * x, 2.0 * apart_scale * y), normal_scale=normal_scale,
-        plane_scale=plane_scale,
-    )  # fmt: skip
-    # Infinity is what another material has, and must not keep a sub-sample from belonging to anyone.
-    nearest, owner = jnp.where(covered, jnp.inf, -1.0), jnp.broadcast_to(jnp.max(seeds, -1, keepdims=True), depth.shape)
+    # A window is two pixels wide.
+    slope = jnp.full((*depth.shape[:-1], 2), 2.0 * jnp.asarray(apart_scale, depth.dtype))
+    features = _features(normal, position, depth, material_id, slope, normal_scale, plane_scale)
+    nearest, owner = jnp.where(covered, jnp.inf, -1.0), jnp.full_like(material_id, -1)
     for k in range(seeds.shape[-1]):
-        seed = seeds[..., k]
-        unlike = jnp.where((seed >= 0)[..., None], _unlike(features, jnp.maximum(seed, 0)), jnp.inf)
-        owner = jnp.where(unlike < nearest, seed[..., None], owner)
+        seed = seeds[..., k, None]
+        unlike = jnp.where(seed >= 0, _unlike(features, jnp.maximum(seeds[..., k], 0)), jnp.inf)
+        # Another material is infinitely unlike, and has an owner all the same.
+        owner = jnp.where((unlike < nearest) | (owner < 0), seed, owner)
         nearest = jnp.minimum(nearest, unlike)
     return _grown(features, covered, nearest, owner, turns=count - seeds.shape[-1], tolerance=0.0)
 
@@ -131,12 +123,6 @@ def _grown(
 
     _, owner, _ = jax.lax.while_loop(unfinished, take, (nearest, owner, 0))
     return jnp.where(covered, owner, -1)
-
-
-def _places(depth: Float[Array, "*b n"]) -> Vector:
-    """x and y of the sub-samples, as shares of the window."""
-    x, y = sample_positions(window_size(depth.shape[-1])).T
-    return tuple(jnp.broadcast_to(jnp.asarray(v, depth.dtype), depth.shape) for v in (x, y))
 
 
 def shading_slope(
@@ -174,6 +160,16 @@ class _Features:
     place: Vector
     normal_scale: float | Float[Array, ""]
     plane_scale: float | Float[Array, ""]
+
+
+def _features(normal, position, depth, material_id, slope, normal_scale, plane_scale) -> _Features:
+    x, y = (jnp.asarray(v, depth.dtype) for v in sample_positions(window_size(depth.shape[-1])).T)
+    x, y = (jnp.broadcast_to(v, depth.shape) for v in (x, y))
+    return _Features(
+        normal=_parts(normal), position=_parts(position), nearness=1.0 / jnp.where(depth > 0.0, depth, 1.0),
+        material_id=material_id, place=(slope[..., :1] * x, slope[..., 1:] * y), normal_scale=normal_scale,
+        plane_scale=plane_scale,
+    )  # fmt: skip
 
 
 def _unlike(features: _Features, sample: Int[Array, "*b"]) -> Float[Array, "*b n"]:

@@ -43,9 +43,9 @@ def highlight_sample_count(
       light: L, linear luma of the first shading.
       scale: c >= 0.
     """
-    axis, chord = normal_cone(normal, covered)
+    axis, chord = normal_cone(normal, covered=covered)
     half_angle = 2.0 * jnp.arcsin(jnp.sqrt(0.5 * jnp.clip(chord, 0.0, 1.0)))
-    wo = normalize(eye - position)
+    wo = normalize(jnp.broadcast_to(eye, position.shape) - position)
     n_o = jnp.maximum(dot(axis, wo)[..., 0], 1e-2)
     alpha2 = jnp.maximum(roughness * roughness, 1e-3) ** 2
 

@@ -92,17 +92,17 @@ def normal_sample_count(
       normal: unit. scale: c >= 0.
       covered: as in `depth_sample_count`.
     """
-    _, chord = normal_cone(normal, covered)
+    _, chord = normal_cone(normal, covered=covered)
     return scale * safe_sqrt(chord)
 
 
 def normal_cone(
-    normal: Float[Array, "*b n 3"], covered: Bool[Array, "*b n"] | None = None
+    normal: Float[Array, "*b n 3"], *, covered: Bool[Array, "*b n"] | None = None
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b"]]:
     """The normalised mean normal n̄, and 1 - min |n̄ · n_ij|, in [0, 1].
 
-    Where normals cancel out the latter is 1; with fewer than two covered sub-samples, or normals that are not finite,
-    it is 0.
+    Where normals cancel out the former is their sum and the latter 1; with fewer than two covered sub-samples, or
+    normals that are not finite, it is 0.
     """
     check_last_axis("normal", normal, 3)
     covered = _mask(normal[..., 0], covered)

@@ -11,6 +11,7 @@ from jaxrender.checks import InputError
 from jaxrender.deferred import (
     Clusters,
     Lighting,
+    QuadBudget,
     SampleMetrics,
     Uniform,
     draw_gbuffer,
@@ -186,6 +187,86 @@ def test_what_cannot_be_is_said(view, scene, camera):
         render_adaptive(scene, camera, size=0, **SIZE)
     with pytest.raises(ValueError, match="count"):
         shade_adaptive(*view, method=Uniform(0))
+
+
+# --- Beyond the paper
+
+
+def test_a_quad_budget_is_spent_and_never_exceeded(view, reference):
+    covered = np.asarray(view[0].covered)
+    per_quad = covered.reshape(18, 2, 24, 2, 9).sum(axis=(1, 3, 4))
+    for count in (4, 8, 20):
+        found = shade_adaptive(*view, method=QuadBudget(count))
+        assert found.num_shaded <= np.minimum(per_quad, count).sum()
+        assert ((found.count > 0) == covered.any(axis=-1)).all()
+        assert np.isfinite(found.image).all()
+    # Where whole quads are covered, and no two sub-samples are at one place, it is spent to the last sample.
+    assert found.num_shaded > 0.9 * np.minimum(per_quad, count).sum()
+    worse = shade_adaptive(*view, method=Uniform(1))
+    assert picture_psnr(found, reference) > picture_psnr(worse, reference) + 3.0
+
+
+def test_a_budget_of_all_samples_is_the_reference(view, reference):
+    same(shade_adaptive(*view, method=QuadBudget(36)), reference)
+
+
+def test_quads_at_odd_borders(scene, camera):
+    samples, lighting = scene_view(scene, camera, size=2, height=7, width=9)
+    reference = supersample(samples, lighting)
+    found = shade_adaptive(samples, lighting, method=QuadBudget(16))
+    np.testing.assert_allclose(found.image, reference.image, atol=1e-6)
+    with pytest.raises(ValueError, match="count: expected a number from 4 to 16, got 3"):
+        shade_adaptive(samples, lighting, method=QuadBudget(3))
+
+
+@pytest.mark.parametrize("method", [Clusters(), SampleMetrics()], ids=["clusters", "printed"])
+def test_a_second_look_from_the_same_place_shades_less_again(view, reference, method):
+    """What the frame before went by is believed: fewer samples are shaded twice, and none are missing."""
+    one = shade_adaptive(*view, method=method)
+    two = shade_adaptive(*view, method=method, previous=one)
+    assert one.evidence.shape == (*one.count.shape, 2 if isinstance(method, Clusters) else 1)
+    assert (two.evidence >= 0.8 * one.evidence - 1e-6).all()
+    assert two.num_shaded - two.count.sum() < one.num_shaded - one.count.sum()
+    assert picture_psnr(two, reference) > picture_psnr(one, reference) - 0.5
+    with pytest.raises(ValueError, match="previous: expected a picture of"):
+        other = dataclasses.replace(one, evidence=one.evidence[:4])
+        shade_adaptive(*view, method=method, previous=other)
+
+
+def test_least_is_a_floor(view):
+    found = shade_adaptive(*view, method=SampleMetrics(depth=None, normal=None, shading=None, least=3))
+    same(found, shade_adaptive(*view, method=Uniform(3)))
+    # Without the shading metric, which sees another first shading.
+    plain, floored = (shade_adaptive(*view, method=SampleMetrics(shading=None, least=k)) for k in (1, 4))
+    covered = np.asarray(view[0].covered).sum(axis=-1)
+    np.testing.assert_array_equal(floored.count, np.minimum(covered, np.maximum(plain.count, 4 * (covered > 0))))
+
+
+def test_normal_maps_ask_for_samples(scene, camera):
+    """A floor that is flat but for its normal map, of bumps wider than a pixel."""
+    u = np.sin(np.linspace(0.0, 40.0 * np.pi, 128, endpoint=False))[None, :, None] * np.ones((128, 1, 1))
+    texels = np.concatenate([0.5 + 0.3 * u, 0.5 + 0.0 * u, 0.9 + 0.0 * u], axis=-1).astype(np.float32)
+    bumps = dataclasses.replace(scene.images[0], texels=texels, srgb=False)
+    slot = jnp.where(scene.material.base_color_texture >= 0, len(scene.images), -1)
+    bumpy = dataclasses.replace(
+        scene, images=(*scene.images, bumps), material=dataclasses.replace(scene.material, normal_texture=slot)
+    )
+    samples, lighting = scene_view(bumpy, camera, size=3, **SIZE)
+    settings = SampleMetrics(depth=None, shading=None, normal=30.0)
+    mapped = dataclasses.replace(settings, mapped_normals=True)
+    smooth, seen = (shade_adaptive(samples, lighting, method=method) for method in (settings, mapped))
+    assert seen.count.sum() > 1.2 * smooth.count.sum()
+    bare = dataclasses.replace(lighting, slots=tuple(s for s in lighting.slots if s != "normal_texture"))
+    same(shade_adaptive(samples, bare, method=mapped), shade_adaptive(samples, bare, method=settings))
+
+
+def test_highlights_ask_for_samples_where_light_is(view):
+    samples, lighting = view
+    only = SampleMetrics(depth=None, normal=None, shading=None, highlight=200.0)
+    lit = shade_adaptive(samples, lighting, method=only)
+    dark = dataclasses.replace(lighting.lights, intensity=jnp.zeros_like(lighting.lights.intensity))
+    unlit = shade_adaptive(samples, dataclasses.replace(lighting, lights=dark), method=only)
+    assert lit.count.max() > 1 and unlit.count.max() == 1
 
 
 # --- The dial

@@ -32,6 +32,10 @@ from jaxrender.io.builtin_scene import builtin_scene
 from jaxrender.scene import whole_scene_camera
 
 SIZE = {"height": 45, "width": 61}
+WITHIN = jax.jit(
+    rasterize_within,
+    static_argnames=("budget", "height", "width", "samples", "cull"),
+)
 FIELDS = ("triangle_id", "screen_id", "barycentrics", "depth", "w")
 
 
@@ -126,18 +130,17 @@ def test_images_without_pixels(scene, height, width):
     fragments = see(scene, camera, **size)
     for gbuffer in (make_gbuffer(scene, fragments), draw_gbuffer(scene, fragments)):
         assert gbuffer.position.shape == (height, width, 1, 3) and gbuffer.triangle_id.shape == (height, width, 1)
-    within, demand = rasterize_within(clip_positions(scene, camera, height=4, width=4), scene.faces,
-                                      Budget(8, 8, 8), **size)  # fmt: skip
+    within, demand = WITHIN(clip_positions(scene, camera, height=4, width=4), scene.faces, Budget(8, 8, 8), **size)
     assert within.depth.shape == (height, width, 1) and not bool(demand.exceeds(Budget(0, 0, 0)))
 
 
 def test_the_pure_form_on_nothing_and_on_wrong_indices(scene):
     clip = clip_positions(scene, whole_scene_camera(scene, aspect=61 / 45), **SIZE)
-    none, demand = rasterize_within(clip, scene.faces[:0], Budget(0, 0, 0), **SIZE)
+    none, demand = WITHIN(clip, scene.faces[:0], Budget(0, 0, 0), **SIZE)
     assert not bool(none.coverage.any()) and not bool(demand.exceeds(Budget(0, 0, 0)))
     budget = Budget(64, 8192, 8192)
     wrong = scene.faces.at[::2, 1].set(len(clip)).at[1::4, 2].set(-1)
-    got, _ = rasterize_within(clip, wrong, budget, **SIZE)
+    got, _ = WITHIN(clip, wrong, budget, **SIZE)
     kept = np.asarray(((wrong >= 0) & (wrong < len(clip))).all(axis=1))
     expected = rasterize(clip, scene.faces, **SIZE, drawn=jnp.asarray(kept))
     assert 0 < kept.sum() < len(kept) and bool(expected.coverage.any())

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from jaxrender.deferred import metrics as jax_metrics
+from tests.support import scenes
 from tests.support.asserts import assert_close
-from tests.support.cases import Case
-from tests.support.tolerances import ROUNDING, TIGHT
+from tests.support.cases import Case, Record
+from tests.support.tolerances import LONG_SUM, ROUNDING, TIGHT
 from tests.twins import both
 from tests.twins.agreement import DTYPES, check
 from torchref.deferred import metrics as torch_metrics
@@ -234,7 +235,52 @@ def _clusters() -> list[Case]:
     ]
 
 
-CASES = [*_metrics(), *_sampling(), *_clusters()]
+def _cones() -> list[Case]:
+    windows = {"normal": _normals(5, 9, bend=0.5), "covered": _covered(5, 9)}
+    return [Case("deferred.metrics.normal_cone", windows, gradients=("normal",), on={"normal": "sphere"})]
+
+
+def _quads() -> list[Case]:
+    cases = []
+    for size, count in ((1, 4), (2, 4), (2, 7), (3, 12)):
+        window = _window_of_surfaces(2 * size, 5)
+        del window["slope"]
+        quarter = np.arange(4).reshape(2, 2).repeat(size, 0).repeat(size, 1).reshape(-1)
+        seeds = np.full((5, 4), -1, np.int32)
+        for row, k in np.ndindex(5, 4):
+            members = np.flatnonzero(window["covered"][row] & (quarter == k))
+            seeds[row, k] = _rng.choice(members) if len(members) else -1
+        window |= {"seeds": seeds, "count": count, "apart_scale": 1.5}
+        cases.append(Case("deferred.clusters.cluster_quads", window, f"{size} x {size}, {count}"))
+    return cases
+
+
+def _highlights() -> list[Case]:
+    """Lights in front of the normals, beside and behind them; windows that are flat, bent, empty in part, or all."""
+    lights = scenes.lights()
+    lights["range"] = np.minimum(lights["range"], 50.0)
+    return [
+        Case(
+            "deferred.highlights.highlight_sample_count",
+            {
+                "normal": _normals(6, 9, bend=bend),
+                "position": _rng.uniform(-1.0, 1.0, (6, 3)),
+                "roughness": _rng.uniform(0.3, 1.0, 6),
+                "light": _rng.uniform(0.05, 0.4, 6),
+                "lights": Record("scene.Lights", lights),
+                "eye": scenes.EYE,
+                "scale": np.array(48.0),
+                "covered": _covered(6, 9),
+            },
+            f"bend {bend}",
+            gradients=("roughness", "light", "scale"),
+            ulps32=LONG_SUM,  # the difference of two values that are nearly the same, 48 times
+        )
+        for bend in (0.01, 0.1, 0.5)
+    ]
+
+
+CASES = [*_metrics(), *_sampling(), *_clusters(), *_cones(), *_quads(), *_highlights()]
 CHAINS = [
     (
         Case("deferred.clusters.cluster_samples", _window_of_surfaces(size, 8), f"{size} x {size}"),

@@ -20,7 +20,7 @@ PAIRED = (
     "vecmath", "camera", "metrics", "scene", "brdf", "harmonics.", "animation.skeleton", "animation.skinning",
     "deferred.samples", "deferred.texture", "deferred.quads", "deferred.warps", "deferred.gbuffer", "deferred.shade",
     "deferred.late", "deferred.metrics", "deferred.sampling", "deferred.clusters", "deferred.fxaa", "deferred.mlaa",
-    "deferred.sraa",
+    "deferred.sraa", "deferred.highlights",
 )  # fmt: skip
 UNPAIRED_MODULES = {"harmonics.pipeline": "the order of the stages, no arithmetic"}
 
@@ -45,6 +45,7 @@ EXCEPTIONS = {
     "deferred.gbuffer.AttributeTable": "jaxrender's own way: what it gathers by sample, in rows",
     "deferred.gbuffer.attribute_table": "the same",
     "deferred.gbuffer.gbuffer_rows": "jaxrender's own way: bands of an image",
+    "deferred.gbuffer.rows_per_band": "the same",
     "deferred.gbuffer.with_motion": "a step of make_gbuffer, which is compared as a whole",
     "deferred.gbuffer.surface_points": "the same, for lists of fragments",
     "deferred.gbuffer.smooth_points": "the same",
@@ -85,6 +86,9 @@ COMPARED_APART = {
     "deferred.sampling.cluster_points": "in tests/twins/test_adaptive.py",
     "deferred.sampling.index_matrix": "in tests/twins/test_adaptive.py",
     "deferred.clusters.cluster_samples": "in tests/twins/test_adaptive.py",
+    "deferred.clusters.cluster_quads": "in tests/twins/test_adaptive.py",
+    "deferred.highlights.highlight_sample_count": "in tests/twins/test_adaptive.py",
+    "deferred.metrics.normal_cone": "in tests/twins/test_adaptive.py",
     "deferred.clusters.shading_slope": "in tests/twins/test_adaptive.py",
     "deferred.fxaa.fxaa": "in tests/twins/test_antialiasing.py",
     "deferred.fxaa.luma": "in tests/twins/test_antialiasing.py",

@@ -44,16 +44,30 @@ def normal_sample_count(
     normal: Float[Tensor, "*b n 3"], *, scale: float | Float[Tensor, ""], covered: Bool[Tensor, "*b n"] | None = None
 ) -> Float[Tensor, "*b"]:
     """c √(1 - cos t) = c √2 sin(t/2), t the largest angle between the line of a normal and the mean normal."""
+    return scale * math.sqrt(2.0) * torch.sin(_by_window(_cone, normal, covered) / 2)
 
-    def count(own: Tensor, there: Tensor) -> Tensor:
-        mean = own.mean(0)
-        if torch.linalg.norm(mean) < 1e-6:
-            return scale * torch.ones((), dtype=own.dtype)
-        across = torch.linalg.norm(torch.linalg.cross(own, mean.expand_as(own)), dim=-1)
-        angle = torch.atan2(across, torch.abs(own @ mean))
-        return scale * math.sqrt(2.0) * torch.sin(angle.amax() / 2)
 
-    return _by_window(count, normal, covered)
+@in_float64
+def normal_cone(
+    normal: Float[Tensor, "*b n 3"], *, covered: Bool[Tensor, "*b n"] | None = None
+) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
+    """The direction of the sum of the normals, and 1 - cos t."""
+    there = torch.ones(normal.shape[:-1], dtype=torch.bool) if covered is None else covered
+    total = torch.where(there[..., None], normal, 0.0).sum(-2)
+    length = torch.linalg.norm(total, dim=-1, keepdim=True)
+    # Of normals that cancel out nothing is left to point anywhere: the sum stays as it is.
+    long_enough = length >= 1e-6 * there.sum(-1, keepdim=True).clamp(min=1)
+    axis = torch.where(long_enough, total / torch.where(long_enough, length, 1.0), total)
+    return axis, 2.0 * torch.sin(_by_window(_cone, normal, covered) / 2) ** 2
+
+
+def _cone(own: Float[Tensor, "k 3"], there: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+    """t, a right angle where normals cancel out."""
+    mean = own.mean(0)
+    if torch.linalg.norm(mean) < 1e-6:
+        return torch.full((), math.pi / 2, dtype=own.dtype)
+    across = torch.linalg.norm(torch.linalg.cross(own, mean.expand_as(own)), dim=-1)
+    return torch.atan2(across, torch.abs(own @ mean)).amax()
 
 
 def _by_window(

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchref._precision import in_float64
+from torchref._srgb import encode_srgb
 from torchref.deferred.fxaa import luma
 
 # Lumas that differ by less are equal.
@@ -48,7 +49,7 @@ def mlaa(
             mixed = sum(
                 (a / total) * ((1 - a) * color[y, x] + a * color[y + dy, x + dx]) for (dy, dx), a in pair.items()
             )
-            pixels.append(_encode(mixed) if linear_light else mixed)
+            pixels.append(encode_srgb(mixed) if linear_light else mixed)
     return torch.stack(pixels).reshape(image.shape)
 
 
@@ -104,8 +105,3 @@ def _line(edge, crossing, y: int, x: int, reach: int) -> tuple[float, float]:
     corners = sorted({float(x), min(max(middle, x), x + 1.0), x + 1.0})
     areas = [(b - a) * (line(a) + line(b)) / 2 for a, b in itertools.pairwise(corners)]
     return sum(max(a, 0.0) for a in areas), sum(max(-a, 0.0) for a in areas)
-
-
-def _encode(light: Tensor) -> Tensor:
-    light = light.clamp(0, 1)
-    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchref._precision import in_float64
+from torchref._srgb import decode_srgb
 
 _REPEAT, _CLAMP, _MIRROR = range(3)
 _MODES = {"repeat": _REPEAT, "clamp": _CLAMP, "mirror": _MIRROR}
@@ -51,7 +52,7 @@ def build_textures(
         if image.dtype == torch.uint8:
             color, alpha = color / 255, alpha / 255
             if encoded:
-                color = torch.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+                color = decode_srgb(color)
         if alpha.shape[-1] == 0:
             alpha = torch.ones_like(color[..., :1])
         chains.append(mip_chain(torch.cat([color, alpha], dim=-1)))
