@@ -17,7 +17,7 @@ over black, against full supersampling of the same m; `psnr_255_db` is the paper
 - `dial`: error over share as all tolerances change together; the share at which it crosses the paper's error. Normal
   maps that a pixel is too coarse for cost most of the samples, so both with and without them.
 - `flicker`: a camera that moves slowly. `flicker_255` is the mean absolute second difference in time less that of the
-  reference, `error_flicker_255` that of the error, both in levels of 255.
+  reference, `error_flicker_255` that of the error, both in levels of 255. "..._averaged" goes by the frame before too.
 - `pictures`: figures and a flight, in `out/adaptive`.
 """
 
@@ -44,6 +44,7 @@ from jaxrender import console
 from jaxrender.camera import Camera
 from jaxrender.deferred.adaptive import Method, Uniform, scene_view, shade_adaptive, supersample
 from jaxrender.deferred.bands import band_starts, in_bands
+from jaxrender.deferred.by_quads import QuadBudget
 from jaxrender.deferred.canvas import AdaptiveImage
 from jaxrender.deferred.clusters import Clusters
 from jaxrender.deferred.fxaa import fxaa
@@ -281,9 +282,20 @@ def _filtered(encoded_filter: Callable[[Array], Array]) -> Callable[..., Shot]:
 def _uniformly(samples: SubSamples, lighting: Lighting, shots: Shots) -> Shot:
     """With the balanced count that is nearest to what the printed metrics shaded."""
     n = samples.depth.shape[-1]
-    wanted = n * shots["printed"].num_shaded / max(shots["printed"].num_covered, 1)
+    wanted = n * _share(shots["printed"])
     count = min(balanced_counts(window_size(n))[:-1], key=lambda k: abs(k - wanted))
     return show(shade_adaptive(samples, lighting, method=Uniform(count)))
+
+
+def _by_quads(samples: SubSamples, lighting: Lighting, shots: Shots) -> Shot:
+    """With as many samples as the printed metrics shaded, the same in each quad."""
+    n = samples.depth.shape[-1]
+    count = min(max(4, round(4 * n * _share(shots["printed"]))), 4 * n - 1)
+    return show(shade_adaptive(samples, lighting, method=QuadBudget(count)))
+
+
+def _share(shot: Shot) -> float:
+    return shot.num_shaded / max(shot.num_covered, 1)
 
 
 def _reconstructed(samples: SubSamples, lighting: Lighting, shots: Shots) -> Shot:
@@ -317,6 +329,7 @@ WAYS: dict[str, Callable[[SubSamples, Lighting, Shots], Shot]] = {
     "printed": lambda samples, lighting, shots: show(shade_adaptive(samples, lighting, method=PRINTED)),
     "adaptive": lambda samples, lighting, shots: show(shade_adaptive(samples, lighting, method=ADAPTIVE)),
     "uniform": _uniformly,
+    "quads": _by_quads,
     "sraa": _reconstructed,
     "single": lambda samples, lighting, shots: show(supersample(samples, lighting)),
     "fxaa": _filtered(jax.jit(fxaa)),
@@ -476,6 +489,10 @@ TERMS: dict[str, SampleMetrics] = {
     "all": PRINTED,
     "all_plane_corrected": SampleMetrics(plane_corrected=True),
     "all_balanced": SampleMetrics(balanced=True),
+    "all_mapped_normals": SampleMetrics(mapped_normals=True),
+    "highlight": SampleMetrics(depth=None, normal=None, shading=None, highlight=48.0),
+    "highlight_shading": SampleMetrics(depth=None, normal=None, highlight=48.0),
+    "all_highlight": SampleMetrics(highlight=48.0),
 }
 
 
@@ -547,29 +564,40 @@ def share_at(goal: float, curve: list[tuple[float, float]]) -> float:
     return math.nan
 
 
-#: Variants of the case `flicker`. Counts averaged over frames are missing: `shade_adaptive` makes them itself.
+#: Variants of the case `flicker`, and those of them that go by the frame before too.
 FLICKERING = ("supersampled", "single", "fxaa", "printed", "adaptive")
+AVERAGED: dict[str, Method] = {"printed_averaged": PRINTED, "adaptive_averaged": ADAPTIVE}
 
 
 def _flicker(place: Place, sizes: Sizes) -> Iterator[Measurement]:
     height, width = sizes.flicker
     start = view_of(place, sizes, size=sizes.flicker_grid)
     start = dataclasses.replace(start, height=height, width=width)
-    films: dict[str, list[np.ndarray]] = {variant: [] for variant in FLICKERING}
-    shares: dict[str, list[float]] = {variant: [] for variant in FLICKERING}
+    shots: dict[str, list[Shot]] = {variant: [] for variant in (*FLICKERING, *AVERAGED)}
+    before: dict[str, AdaptiveImage | None] = dict.fromkeys(AVERAGED)
     for frame in range(sizes.flicker_frames):
         frames = Frames(dataclasses.replace(start, camera=_moved(place, start.camera, frame)), keep=True)
         for variant in FLICKERING:
-            films[variant].append(frames.draw(variant))
-            shares[variant].append(amount(frames.shots[variant], frames.reference())["sample_share"])
-    reference = np.stack(films["supersampled"])
-    for variant in FLICKERING:
-        film = np.stack(films[variant])
+            frames.draw(variant)
+            shots[variant].append(frames.shots[variant])
+        for variant, method in AVERAGED.items():
+            drawn = shade_adaptive(*frames.rasterised(start.size), method=method, previous=before[variant])
+            before[variant] = drawn
+            shots[variant].append(show(drawn))
+    references = shots["supersampled"]
+    reference = np.stack([shot.image for shot in references])
+    for variant, own in shots.items():
+        film = np.stack([shot.image for shot in own])
         numbers = {
             "flicker_255": _restlessness(film) - _restlessness(reference),
             "error_flicker_255": _restlessness(film - reference),
-            "sample_share": float(np.mean(shares[variant])),
+            "sample_share": float(
+                np.mean([amount(*pair)["sample_share"] for pair in zip(own, references, strict=True)])
+            ),
         }
+        if variant not in ("supersampled", "single", "fxaa"):
+            decibel = [judge(*pair)["psnr_db"] for pair in zip(own, references, strict=True)]
+            numbers["psnr_db"] = float(np.mean(decibel))
         yield Measurement("flicker", variant, numbers, start.params(frames=sizes.flicker_frames))
 
 

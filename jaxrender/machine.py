@@ -48,14 +48,18 @@ def avoid_wrong_sums() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} --{option}=".strip()
 
 
-def on_all_cores(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+def on_all_cores(
+    function: Callable[[Item], Result], items: Sequence[Item], *, compiled: bool = False
+) -> Iterator[Result]:
     """Gives function(item) of all items, in their order, as many at once as there are cores.
 
-    The first one runs alone: what it compiles is there for the others, and no two threads compile at once.
+    The first one runs alone: what it compiles is there for the others, and no two threads compile at once. Not if all
+    is `compiled` already.
     """
-    yield from map(function, items[:1])
+    alone = 0 if compiled else 1
+    yield from map(function, items[:alone])
     with ThreadPoolExecutor(num_cores()) as threads:
-        yield from threads.map(function, items[1:])
+        yield from threads.map(function, items[alone:])
 
 
 def cpu_model() -> str:

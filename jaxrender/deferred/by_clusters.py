@@ -28,15 +28,15 @@ def shade_by_clusters(canvas: Canvas, method: Clusters, *, previous: Float[np.nd
     """
     samples, n = canvas.samples, canvas.covered.shape[-1]
     pixel = covered_pixels(canvas.covered)
-    one_surface, first = (np.asarray(v).reshape(-1) for v in _first_look(samples))
+    one_surface = np.asarray(_on_one_surface(samples)).reshape(-1)
     expected = np.zeros((len(one_surface), 2), np.float32)
     if previous is not None:
         faded, uneven = _faded(previous, n=n)
         expected, one_surface = np.asarray(faded).reshape(-1, 2), one_surface & ~np.asarray(uneven).reshape(-1)
     # A single sub-sample stands for itself, which is another footprint.
-    whole = (one_surface & (np.count_nonzero(canvas.windows, axis=1) > 1))[pixel]
-    canvas.shade_whole(pixel[whole], first[pixel[whole]].astype(np.int32))
-    several = pixel[~whole]
+    whole = one_surface[pixel] & (np.count_nonzero(canvas.windows[pixel], axis=1) > 1)
+    several, pixels = pixel[~whole], pixel[whole]
+    canvas.shade_whole(pixels, in_calls(_first_sample, WINDOWS_PER_CALL, canvas.windows[pixels]))
     canvas.shade_clusters(several, _clusters(samples, several, expected[several], method))
     if method.contrast == 0.0 and method.detail == 0.0:
         return
@@ -53,12 +53,11 @@ def shade_by_clusters(canvas: Canvas, method: Clusters, *, previous: Float[np.nd
 
 def _clusters(samples: SubSamples, pixel, slope, method: Clusters) -> Int[np.ndarray, "p n"]:
     scales = np.float32(method.normal * method.scale), np.float32(method.plane * method.scale)
-    group = lambda pixel, slope: _cluster_windows(samples, pixel, slope, *scales)  # noqa: E731
-    return in_calls(group, WINDOWS_PER_CALL, pixel.astype(np.int32), slope)
+    return in_calls(_cluster_windows, WINDOWS_PER_CALL, pixel.astype(np.int32), slope, fixed=(samples, *scales))
 
 
 @jax.jit
-def _cluster_windows(samples: SubSamples, pixel, slope, normal_scale, plane_scale) -> Int[Array, "p n"]:
+def _cluster_windows(samples: SubSamples, normal_scale, plane_scale, pixel, slope) -> Int[Array, "p n"]:
     n = samples.depth.shape[-1]
 
     def group(block: tuple[Array, Array]) -> Int[Array, "b n"]:
@@ -72,9 +71,8 @@ def _cluster_windows(samples: SubSamples, pixel, slope, normal_scale, plane_scal
     return by_block(group, WINDOWS_PER_BLOCK, pixel, slope)
 
 
-@jax.jit
-def _first_look(samples: SubSamples) -> tuple[Bool[Array, "h w"], Int[Array, "h w"]]:
-    return samples.one_surface, first_sample(samples.covered).astype(jnp.int8)
+_on_one_surface = jax.jit(lambda samples: samples.one_surface)
+_first_sample = jax.jit(first_sample)
 
 
 @functools.partial(jax.jit, static_argnames="n")

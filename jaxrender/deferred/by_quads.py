@@ -50,8 +50,8 @@ def shade_by_quads(canvas: Canvas, method: QuadBudget) -> None:
     some = covered.any(axis=1)
     pixel, place, covered = pixel[some], place[some], covered[some]
     scales = tuple(np.float32(v) for v in (method.normal, method.plane, method.apart))
-    group = lambda place, covered: _cluster_quads(canvas.samples, place, covered, *scales, count=method.count)  # noqa: E731
-    owner = in_calls(group, WINDOWS_PER_CALL, place, covered)
+    fixed = canvas.samples, *scales
+    owner = in_calls(_cluster_quads, WINDOWS_PER_CALL, place, covered, fixed=fixed, count=method.count)
     quad, sample = leads(owner)
     owners = owner[quad]
     alone = np.count_nonzero(owners == sample[:, None], axis=1) == 1
@@ -87,7 +87,7 @@ def _quad_places(height: int, width: int, n: int) -> tuple[Int[np.ndarray, "q 4"
 
 @functools.partial(jax.jit, static_argnames="count")
 def _cluster_quads(
-    samples: SubSamples, place, covered, normal_scale, plane_scale, apart_scale, *, count: int
+    samples: SubSamples, normal_scale, plane_scale, apart_scale, place, covered, *, count: int
 ) -> Int[Array, "q 4n"]:
     n = place.shape[-1] // 4
     quarter = _quarter(n)
@@ -107,8 +107,7 @@ def _cluster_quads(
     return by_block(group, WINDOWS_PER_BLOCK, place, covered)
 
 
-@jax.jit
-def _quad_points(owner, sample) -> ShadingPoints:
+def _quad_points(_n: int, owner, sample) -> ShadingPoints:
     """As of one window twice as wide and high as a pixel."""
     points = cluster_points(owner.astype(jnp.int32), sample)
     return ShadingPoints(weight=points.weight, shift=2.0 * points.shift, spread=2.0 * points.spread)

@@ -75,8 +75,9 @@ class Canvas:
 
     def shade_whole(self, pixel: Int[np.ndarray, " p"], sample: Int[np.ndarray, " p"]) -> None:
         """Shades one sample of some pixels for all that is covered of them."""
-        windows, place = self.windows[pixel], pixel * self.covered.shape[-1] + sample
-        radiance, detail, _, _ = self.shade(_whole_points, place, np.zeros(len(pixel), bool), windows, sample)
+        place = pixel * self.covered.shape[-1] + sample
+        owner = np.where(self.windows[pixel], sample[:, None], -1).astype(np.int8)
+        radiance, detail, _, _ = self.shade(_cluster_points, place, np.zeros(len(pixel), bool), owner, sample)
         self.image[pixel], self.detail[pixel], self.count[pixel] = radiance, detail, 1
 
     def shade_prefixes(
@@ -88,27 +89,28 @@ class Canvas:
         # A footprint of more than one cell has more taps; where all samples are taken it is one.
         every = count >= np.count_nonzero(windows, axis=1)
         area = np.where(every, n, count).astype(np.int32)
-        points = functools.partial(_prefix_points, size=window_size(n))
-        radiance, _, roughness, weight = self.shade(points, pixel * n + sample, every, area, count, windows.all(axis=1))
+        place, whole = pixel * n + sample, windows.all(axis=1)
+        radiance, _, roughness, weight = self.shade(_prefix_points, place, every, area, count, whole)
         return sample, radiance, roughness, weight
 
     def shade(
         self, points: Callable[..., ShadingPoints], place: Int[np.ndarray, " b"], alone: Bool[np.ndarray, " b"],
         *arguments: np.ndarray,
     ) -> list[np.ndarray]:  # fmt: skip
-        """Radiance, detail, roughness and weight of points(*arguments); those `alone` need one lookup of textures."""
+        """Radiance, detail, roughness and weight of points(n, *arguments); those `alone` need one lookup of textures.
+
+        Args:
+          points: gives the points of a block; n is the number of sub-samples of a window.
+        """
         self.num_shaded += len(place)
         found = [np.zeros((len(place), 3), np.float32), *np.zeros((3, len(place)), np.float32)]
         for taps, kind in ((1, np.flatnonzero(alone)), (TAPS, np.flatnonzero(~alone))):
             if not len(kind):
                 continue
-
-            def shaded(place, *arguments, taps=taps):
-                where = points(*arguments)
-                return *_shade_points(self.samples, self.lighting, place, where, taps=taps), where.weight
-
             own = (values[kind] for values in (place.astype(np.int32), *arguments))
-            for whole, part in zip(found, in_calls(shaded, POINTS_PER_CALL, *own), strict=True):
+            fixed = self.samples, self.lighting
+            parts = in_calls(_shade_points, POINTS_PER_CALL, *own, fixed=fixed, points=points, taps=taps)
+            for whole, part in zip(found, parts, strict=True):
                 whole[kind] = part
         return found
 
@@ -142,26 +144,24 @@ def leads(owner: Int[np.ndarray, "p n"]) -> tuple[Int[np.ndarray, " b"], Int[np.
     return row.astype(np.int32), sample.astype(np.int32)
 
 
-@functools.partial(jax.jit, static_argnames="taps")
-def _shade_points(samples, lighting, place, points, *, taps: int):
-    shaded = lambda block: shade_points(samples, lighting, *block, taps=taps)  # noqa: E731
-    return by_block(shaded, POINTS_PER_BLOCK, place, points)
+@functools.partial(jax.jit, static_argnames=("points", "taps"))
+def _shade_points(
+    samples, lighting, place, *arguments, points: Callable[..., ShadingPoints], taps: int
+) -> tuple[Array, Array, Array, Array]:
+    def shaded(block: tuple[Array, ...]) -> tuple[Array, Array, Array, Array]:
+        where = points(samples.depth.shape[-1], *block[1:])
+        return *shade_points(samples, lighting, block[0], where, taps=taps), where.weight
+
+    return by_block(shaded, POINTS_PER_BLOCK, place, *arguments)
 
 
-@jax.jit
-def _cluster_points(owner, sample) -> ShadingPoints:
+def _cluster_points(_n: int, owner, sample) -> ShadingPoints:
     return cluster_points(owner.astype(jnp.int32), sample)
 
 
-@jax.jit
-def _whole_points(covered, sample) -> ShadingPoints:
-    return cluster_points(jnp.where(covered, sample[:, None], -1), sample)
-
-
-@functools.partial(jax.jit, static_argnames="size")
-def _prefix_points(area, count, whole, *, size: int) -> ShadingPoints:
+def _prefix_points(n: int, area, count, whole) -> ShadingPoints:
     # Of a window that is covered in part other samples are taken than the first ones of the matrix: they stay in place.
-    points = prefix_points(area, size=size)
+    points = prefix_points(area, size=window_size(n))
     shift = jnp.where(whole[:, None], points.shift, 0.0)
     return dataclasses.replace(points, shift=shift, weight=1.0 / count.astype(jnp.float32))
 

@@ -1,6 +1,7 @@
 """Work on lists of points or windows, which have any length: in calls of one size, on all cores, block by block."""
 
 import functools
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
@@ -15,20 +16,50 @@ from jaxrender.machine import on_all_cores
 POINTS_PER_CALL, POINTS_PER_BLOCK, WINDOWS_PER_CALL, WINDOWS_PER_BLOCK = 1 << 16, 1024, 1 << 14, 256
 
 
-def in_calls(function: Callable[..., Any], size: int, *arguments: np.ndarray) -> Any:
-    """function(*arguments) by calls of one size, at most `size`, on all cores; the last one is filled up."""
+def in_calls(
+    function: Callable[..., Any], size: int, *arguments: np.ndarray, fixed: tuple[Any, ...] = (), **static: Any
+) -> Any:
+    """function(*fixed, *arguments, **static) by calls of one size, at most `size`, on all cores; the last is filled up.
+
+    Args:
+      function: jitted, pointwise over `arguments`; gives NumPy arrays here.
+    """
     total = len(arguments[0])
     # Two blocks at least: XLA compiles a loop of one turn to other code, which rounds in other places.
     size = min(size, max(2, -(-room_for(total) // POINTS_PER_BLOCK)) * POINTS_PER_BLOCK)
 
-    def call(start: int) -> Any:
+    def cut(start: int) -> list[np.ndarray]:
         own = [values[start : start + size] for values in arguments]
         missing = size - len(own[0])
-        filled = [np.concatenate([values, np.zeros((missing, *values.shape[1:]), values.dtype)]) for values in own]
-        return jax.tree.map(lambda values: np.asarray(values)[: size - missing], function(*filled))
+        return [np.concatenate([values, np.zeros((missing, *values.shape[1:]), values.dtype)]) for values in own]
 
-    calls = list(on_all_cores(call, range(0, max(total, 1), size)))
+    if not total:
+        shapes = jax.eval_shape(functools.partial(function, **static), *fixed, *cut(0))
+        return jax.tree.map(lambda shape: np.zeros((0, *shape.shape[1:]), shape.dtype), shapes)
+    program = _program(function, (*fixed, *cut(0)), static)
+
+    def call(start: int) -> Any:
+        return jax.tree.map(lambda values: np.asarray(values)[: total - start], program(*fixed, *cut(start)))
+
+    calls = list(on_all_cores(call, range(0, total, size), compiled=True))
     return jax.tree.map(lambda *values: np.concatenate(values), *calls)
+
+
+#: Programs that were used last, by function, options, and the types of all arguments.
+_PROGRAMS: OrderedDict[Any, Callable[..., Any]] = OrderedDict()
+_MOST_PROGRAMS = 64
+
+
+def _program(function: Any, arguments: tuple[Any, ...], static: dict[str, Any]) -> Callable[..., Any]:
+    """The function, compiled for such arguments before any thread calls it: no two of them may compile at once."""
+    leaves, structure = jax.tree.flatten(arguments)
+    key = function, tuple(static.items()), structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+    if key not in _PROGRAMS:
+        _PROGRAMS[key] = function.lower(*arguments, **static).compile()
+    _PROGRAMS.move_to_end(key)
+    while len(_PROGRAMS) > _MOST_PROGRAMS:
+        _PROGRAMS.popitem(last=False)
+    return _PROGRAMS[key]
 
 
 def by_block(function: Callable[[Any], Any], block: int, *arguments: Any) -> Any:
