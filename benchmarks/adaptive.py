@@ -13,7 +13,8 @@ over black, against full supersampling of the same m; `psnr_255_db` is the paper
 - `metrics`: the terms of the printed metrics alone and together, balanced counts, trilinear lookups (against the
   anisotropic reference); at the default scale, and at a larger one for what is too few samples only.
 - `strategies`: the ways to evaluate the samples of the printed metrics. `predicted_ratio` is lanes paid over samples
-  shaded by "compacted" in warps of 32, `measured_ratio` the time over that of "compacted".
+  shaded by "compacted" in warps of 32, `measured_ratio` the time over that of "compacted"; `predicted_gain` is what
+  shading gains over full supersampling if lanes are all that counts.
 - `dial`: error over share as all tolerances change together; the share at which it crosses the paper's error. Normal
   maps that a pixel is too coarse for cost most of the samples, so both with and without them.
 - `flicker`: a camera that moves slowly. `flicker_255` is the mean absolute second difference in time less that of the
@@ -51,6 +52,7 @@ from jaxrender.deferred.fxaa import fxaa
 from jaxrender.deferred.metrics import SampleMetrics, balanced_counts
 from jaxrender.deferred.mlaa import mlaa
 from jaxrender.deferred.pipeline import scene_material_textures
+from jaxrender.deferred.point_lists import screen_order
 from jaxrender.deferred.point_shading import Lighting
 from jaxrender.deferred.sampling import first_sample, window_size
 from jaxrender.deferred.sraa import sraa
@@ -444,6 +446,7 @@ def _one_sample(view: View, sizes: Sizes) -> Iterator[Measurement]:
 
 def _timed(case: str, view: View, sizes: Sizes) -> Iterator[Measurement]:
     """All ways to draw a view, in turn."""
+    jax.clear_caches()  # a process has room for some thousands of programs, and every view brings its own
     frames = Frames(view)
     variants = {variant: functools.partial(frames.draw, variant) for variant in WAYS}
     timings = measure_alternating(variants, min_runs=sizes.min_runs, min_seconds=0.0, max_runs=1)
@@ -456,6 +459,7 @@ def _timed(case: str, view: View, sizes: Sizes) -> Iterator[Measurement]:
 
 def _judged(view: View, sizes: Sizes) -> Iterator[Measurement]:
     """All ways to draw a view, once, without times."""
+    jax.clear_caches()
     frames = Frames(view, keep=True)
     for variant in WAYS:
         frames.draw(variant)
@@ -525,6 +529,7 @@ def _strategies(place: Place, sizes: Sizes) -> Iterator[Measurement]:
         numbers = {
             "sample_share": drawn[strategy].sample_share,
             "predicted_ratio": _lanes_paid(drawn[strategy].count, strategy) / max(int(plain.count.sum()), 1),
+            "predicted_gain": plain.num_covered / max(_lanes_paid(drawn[strategy].count, strategy), 1),
             "measured_ratio": timing.ms_median / timings["compacted"].ms_median,
             "mse_to_compacted": judge(show(drawn[strategy]), show(plain))["mse"],
         }
@@ -535,7 +540,7 @@ def _lanes_paid(count: Int[np.ndarray, "h w"], strategy: str) -> int:
     """What warps of 32 lanes pay for these counts."""
     if strategy in ("masked", "low_resolution"):
         return int(jnp.sum(warp_cost(jnp.asarray(count), order="blocks").paid))
-    return len(work_order(count.reshape(-1), strategy=strategy)[0])
+    return len(work_order(count.reshape(-1)[screen_order(*count.shape)], strategy=strategy)[0])
 
 
 def _dial(place: Place, sizes: Sizes) -> Iterator[Measurement]:

@@ -144,7 +144,8 @@ class Render(SceneView):
     exposure_stops: float = 0.0
     """Brightens the PNG by powers of two."""
     exr: bool = False
-    """Also write linear radiance, albedo, normals, position, depth, uv and ids as layers of an OpenEXR file."""
+    """Also write linear radiance, albedo, normals, position, depth, uv and ids as layers of an OpenEXR file; with
+    --adaptive, radiance and sample counts."""
     json: bool = False
     """Print one JSON object instead of the list of files."""
 

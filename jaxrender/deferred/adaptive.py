@@ -6,6 +6,8 @@ References:
   Holländer, Boubekeur, Eisemann, "Adaptive Supersampling for Deferred Anti-Aliasing", JCGT 2(1), 2013.
 """
 
+import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,7 +54,7 @@ def render_supersampled(
 ) -> AdaptiveImage:
     """Full ordered-grid supersampling: every sub-sample is shaded, with the footprint of its own cell.
 
-    The reference of `render_adaptive`; the same arguments.
+    The reference of `render_adaptive`; the same arguments, but for those of the choice.
     """
     samples, lighting = scene_view(scene, camera, height=height, width=width, size=size, **options)
     return supersample(samples, lighting)
@@ -83,7 +85,7 @@ def scene_view(
     """Rasterises a scene: its sub-samples, and what shading them needs. Arguments as in `render_scene`."""
     check_at_least("height", height, 1)
     check_at_least("width", width, 1)
-    _check_size(size)
+    _check_size(height, width, size)
     grid = ordered_grid(size)
     textures = scene_material_textures(scene) if textures is None else textures
     fragments = see(
@@ -100,15 +102,29 @@ def scene_view(
 
 def gbuffer_view(gbuffer: GBuffer, material: Material, *, size: int) -> GBufferSamples:
     """The sub-samples of a G-buffer: one with m x m samples a pixel, or one of m times the picture's size."""
-    _check_size(size)
+    _check_size(1, 1, size)
     if gbuffer.depth.shape[-1] != size * size:
         gbuffer = group_samples(gbuffer, size=size)
+    height, width, _ = gbuffer.depth.shape
+    _check_size(height, width, size)
     return GBufferSamples(material=material, gbuffer=gbuffer)
 
 
-def _check_size(size: int) -> None:
-    if not 1 <= size <= _LARGEST_SIZE:
-        raise ValueError(f"size: expected a number from 1 to {_LARGEST_SIZE}, got {size}")
+def _check_size(height: int, width: int, size: int) -> None:
+    if not isinstance(size, int) or not 1 <= size <= _LARGEST_SIZE:
+        raise ValueError(f"size: expected a whole number from 1 to {_LARGEST_SIZE}, got {size}")
+    if height * width * size * size >= 2**31:
+        raise ValueError(
+            f"size: expected fewer than 2^31 sub-samples, got {height} x {width} pixels of {size} x {size}"
+        )
+
+
+def _check_settings(method: Method) -> None:
+    """All numbers of a method are finite, and none is negative."""
+    for field in dataclasses.fields(method):
+        value = getattr(method, field.name)
+        if value is not None and not 0.0 <= value < math.inf:
+            raise ValueError(f"{type(method).__name__}.{field.name}: expected a number >= 0, got {value}")
 
 
 def supersample(samples: SubSamples, lighting: Lighting) -> AdaptiveImage:
@@ -129,10 +145,12 @@ def shade_adaptive(
       samples, lighting: of `scene_view`, or of `gbuffer_view` and made by hand.
       strategy: how the samples of a count are put together for evaluation (`work_order`); the image is the same, but
         for "low_resolution". Other methods than counts are always compacted.
-      previous: the picture of the frame before in a film, by the same method and of the same size. What it went by
-        fades slowly (`average_over_frames`): counts jump less, and fewer samples have to be shaded again.
+      previous: the picture of the frame before in a film, by the same method and of the same size; `QuadBudget` does
+        not look at it. What it went by fades slowly (`average_over_frames`): counts jump less, and fewer samples have
+        to be shaded again.
     """
     check_one_of("strategy", strategy, STRATEGIES)
+    _check_settings(method)
     counted = isinstance(method, SampleMetrics | Uniform)
     if strategy != "compacted" and not counted:
         raise ValueError(f'strategy: expected "compacted" for {type(method).__name__}, got {strategy}')

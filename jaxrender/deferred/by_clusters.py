@@ -40,8 +40,10 @@ def shade_by_clusters(canvas: Canvas, method: Clusters, *, previous: Float[np.nd
     canvas.shade_clusters(several, _clusters(samples, several, expected[several], method))
     if method.contrast == 0.0 and method.detail == 0.0:
         return
+    # Within a cluster a material varies less than within the pixel: about as much less as the cluster is narrower.
+    detail = canvas.detail if previous is None else canvas.detail * np.sqrt(canvas.count, dtype=np.float32)
     slope, uneven = _slopes(
-        canvas.as_map(canvas.image), canvas.covered.any(axis=-1), canvas.as_map(canvas.detail), previous,
+        canvas.as_map(canvas.image), canvas.covered.any(axis=-1), canvas.as_map(detail), previous,
         np.float32(method.contrast * method.scale), np.float32(method.detail * method.scale), n=n,
     )  # fmt: skip
     canvas.evidence = np.asarray(slope)

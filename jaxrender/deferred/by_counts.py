@@ -84,7 +84,8 @@ def _geometric_metric(samples: SubSamples, lighting: Lighting, method: SampleMet
     """max(k_d, k_n) before it becomes a count."""
     height, width, n = samples.depth.shape
     band = rows_per_band(height, width * n)
-    far = jnp.maximum(jnp.max(jnp.where(samples.covered, samples.depth, 0.0)), 1e-30)
+    known = samples.covered & jnp.isfinite(samples.depth)
+    far = jnp.max(jnp.where(known, samples.depth, 0.0), initial=1e-30)
     scales = [None if c is None else np.float32(c * method.scale) for c in (method.depth, method.normal)]
     rows = functools.partial(
         _metric_rows, samples, lighting, far, *scales, np.float32(method.least), num_rows=band,
@@ -129,36 +130,43 @@ def _with_shading(canvas: Canvas, method: SampleMetrics, metric: Float[Array, "h
     """The metric, or those that look at the first shading where they are larger."""
     if method.shading is not None:
         by_shading = shading_sample_count(
-            _luma(canvas.as_map(canvas.image)), scale=method.shading * method.scale,
+            _encoded_luma(canvas.as_map(canvas.image)), scale=method.shading * method.scale,
             edge_threshold=method.edge_threshold, min_threshold=method.min_threshold,
             covered=jnp.asarray(canvas.covered.any(axis=-1)),
         )  # fmt: skip
         metric = jnp.maximum(metric, by_shading)
-    if method.highlight is not None:
-        metric = jnp.maximum(metric, _highlight_metric(canvas, np.float32(method.highlight * method.scale)))
+    if method.highlight is not None and canvas.lighting.model != "lambert":
+        metric = jnp.maximum(metric, _highlight_metric(canvas, method))
     return metric
 
 
-def _highlight_metric(canvas: Canvas, scale: np.float32) -> Float[Array, "h w"]:
+def _highlight_metric(canvas: Canvas, method: SampleMetrics) -> Float[Array, "h w"]:
+    assert method.highlight is not None
     height, width, n = canvas.covered.shape
     band = rows_per_band(height, width * n)
-    light, roughness = _luma_of(canvas.as_map(canvas.image)), canvas.as_map(canvas.roughness)
-    rows = functools.partial(_highlight_rows, canvas.samples, canvas.lighting, light, roughness, scale, num_rows=band)
+    light, roughness = _linear_luma(canvas.as_map(canvas.image)), canvas.as_map(canvas.roughness)
+    rows = functools.partial(
+        _highlight_rows, canvas.samples, canvas.lighting, light, roughness, np.float32(method.highlight * method.scale),
+        num_rows=band, mapped_normals=method.mapped_normals,
+    )  # fmt: skip
     return in_bands(lambda start: rows(np.int32(start)), band_starts(height, band), height=height)
 
 
-@functools.partial(jax.jit, static_argnames="num_rows")
-def _highlight_rows(samples, lighting, light, roughness, scale, start, *, num_rows: int) -> Float[Array, "r w"]:
+@functools.partial(jax.jit, static_argnames=("num_rows", "mapped_normals"))
+def _highlight_rows(
+    samples, lighting, light, roughness, scale, start, *, num_rows: int, mapped_normals: bool
+) -> Float[Array, "r w"]:
     _, width, n = samples.depth.shape
     cut = lambda values: jax.lax.dynamic_slice_in_dim(values, start, num_rows)  # noqa: E731
     covered = cut(samples.covered)
     place = start * (width * n) + jnp.arange(num_rows * width * n, dtype=jnp.int32).reshape(covered.shape)
     found, _ = samples.look(place)
     position = jnp.take_along_axis(found.position, first_sample(covered)[..., None, None], axis=-2)[..., 0, :]
+    normal = _normals(samples, lighting if mapped_normals else None, place)
     return highlight_sample_count(
-        found.normal, position, cut(roughness), cut(light), lighting.lights, lighting.eye, scale=scale, covered=covered
+        normal, position, cut(roughness), cut(light), lighting.lights, lighting.eye, scale=scale, covered=covered
     )
 
 
-_luma = jax.jit(lambda image: luma(encode_srgb(jnp.asarray(image))))
-_luma_of = jax.jit(lambda image: luma(jnp.asarray(image)))
+_encoded_luma = jax.jit(lambda image: luma(encode_srgb(jnp.asarray(image))))
+_linear_luma = jax.jit(lambda image: luma(jnp.asarray(image)))

@@ -15,6 +15,9 @@ from jaxrender.deferred.point_shading import TAPS, Lighting, shade_points
 from jaxrender.deferred.sampling import ShadingPoints, cluster_points, prefix_points, sample_rank, window_size
 from jaxrender.deferred.subsamples import SubSamples
 
+#: Sub-samples whose windows are listed at a time: each of them may be a row of a list as wide as the window.
+SUBSAMPLES_AT_ONCE = 1 << 22
+
 
 @dataclass(frozen=True)
 class AdaptiveImage:
@@ -66,6 +69,11 @@ class Canvas:
 
     def shade_clusters(self, pixel: Int[np.ndarray, " p"], owner: Int[np.ndarray, "p n"]) -> None:
         """Shades one sample of each cluster of some pixels, instead of what they had."""
+        most = max(1, SUBSAMPLES_AT_ONCE // owner.shape[1])
+        for start in range(0, len(pixel), most):
+            self._shade_clusters(pixel[start : start + most], owner[start : start + most])
+
+    def _shade_clusters(self, pixel: Int[np.ndarray, " p"], owner: Int[np.ndarray, "p n"]) -> None:
         row, sample = leads(owner)
         owners = owner[row]
         alone = np.count_nonzero(owners == sample[:, None].astype(owner.dtype), axis=1) == 1

@@ -135,12 +135,15 @@ def shading_slope(
 ) -> Float[Array, "*b 2"]:
     """How much the shading of pixels is expected to change over a pixel in x and y, in units of the tolerance.
 
+    0 where that is not a finite number.
+
     Args:
       steps: of `shading_steps`; detail: of `material_detail`; luma: display-encoded.
       contrast_scale, detail_scale: of `Clusters`, times its `scale`.
     """
     textured = detail_scale * detail * luma
-    return jnp.sqrt((contrast_scale * steps) ** 2 + (textured * textured)[..., None])
+    slope = jnp.sqrt((contrast_scale * steps) ** 2 + (textured * textured)[..., None])
+    return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
 def is_uneven(slope: Float[Array, "*b 2"], n: int) -> Bool[Array, "*b"]:
@@ -184,6 +187,8 @@ def _unlike(features: _Features, sample: Int[Array, "*b"]) -> Float[Array, "*b n
     distance2 = (off * at(features.nearness) * features.plane_scale) ** 2
     distance2 += features.normal_scale**2 * sum((a - b) ** 2 for a, b in zip(features.normal, normal, strict=True))
     distance2 += sum((values - at(values)) ** 2 for values in features.place)
+    # What is not a number is like everything else, and keeps nobody from being taken.
+    distance2 = jnp.where(jnp.isnan(distance2), 0.0, distance2)
     return jnp.where(features.material_id == at(features.material_id), distance2, jnp.inf)
 
 

@@ -76,6 +76,9 @@ def _search(
 ) -> tuple[Scalable, AdaptiveImage]:  # fmt: skip
     """Bisects between the end of the range that fits and the other one; goes as far from the first as it can."""
 
+    if not isinstance(method, Clusters | SampleMetrics):
+        raise ValueError(f"method: expected Clusters or SampleMetrics, got {type(method).__name__}")
+
     def draw(exponent: float) -> tuple[Scalable, AdaptiveImage]:
         scaled = dataclasses.replace(method, scale=2.0**exponent)
         return scaled, shade_adaptive(samples, lighting, method=scaled)

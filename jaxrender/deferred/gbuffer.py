@@ -104,7 +104,7 @@ def attribute_table(
 
 def rows_per_band(height: int, samples_per_row: int, *, times: int = 1) -> int:
     """Rows of an image that are interpolated at a time: `SAMPLES_PER_BAND` samples, or some times as many."""
-    return min(max(1, times * SAMPLES_PER_BAND // samples_per_row), height)
+    return min(max(1, times * SAMPLES_PER_BAND // max(1, samples_per_row)), height)
 
 
 def make_gbuffer(

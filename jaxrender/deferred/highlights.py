@@ -35,7 +35,8 @@ def highlight_sample_count(
     """k_h = c (e(L + r) - e(L)): the step, display-encoded, from the first shading L to it and all that may be added.
 
     r = Σ over lights of E F0 (max D - min D) V n·l, where D (Trowbridge-Reitz) is taken at the smallest and largest
-    angle that a half vector can have with a normal of the window's cone, and V = 1/(4 n·l n·v).
+    angle that a half vector can have with a normal of the window's cone, V = 1/(4 n·l n·v) and F0 = 4 %: the highlights
+    of metals are stronger, and those at grazing angles.
 
     Args:
       normal: unit, of the sub-samples; covered: which of them are there, all by default.

@@ -181,7 +181,7 @@ def _with_neighbours(luminance: Float[Array, "h w"], covered: Bool[Array, "h w"]
 
 
 def sample_count(*metrics: Float[Array, "*b"], size: int, allowed: tuple[int, ...] | None = None) -> Int[Array, "*b"]:
-    """K = clamp(⌈max of the metrics⌉, 1, m²).
+    """K = clamp(⌈max of the metrics⌉, 1, m²); 1 where that is not a number.
 
     Args:
       size: m.
@@ -193,6 +193,7 @@ def sample_count(*metrics: Float[Array, "*b"], size: int, allowed: tuple[int, ..
     for other in metrics[1:]:
         check_same_shape("metrics", largest, other)
         largest = jnp.maximum(largest, other)
+    largest = jnp.where(jnp.isnan(largest), 0.0, largest)
     count = jnp.clip(jnp.ceil(largest), 1, size * size).astype(jnp.int32)
     if allowed is None:
         return count
@@ -234,7 +235,7 @@ def average_over_frames(
     What rises is taken at once, what falls goes down slowly: a new edge is never missed.
 
     Args:
-      previous: what this function gave for the frame before.
+      previous: what this function gave for the frame before; what is not finite counts as 0.
       share: of the previous value, in [0, 1).
     References:
       Holländer et al., 2013, section 6; after Herzog et al., "Spatio-Temporal Upsampling on the GPU", 2010.
@@ -242,6 +243,8 @@ def average_over_frames(
     check_same_shape("metric and previous", metric, previous)
     if not 0.0 <= share < 1.0:
         raise ValueError(f"share: expected a number in [0, 1), got {share}")
+    # What was not a number must not stay so for the rest of the film.
+    previous = jnp.where(jnp.isfinite(previous), previous, 0.0)
     return jnp.maximum(metric, share * previous + (1.0 - share) * metric)
 
 

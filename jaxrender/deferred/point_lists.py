@@ -1,11 +1,13 @@
 """Work on lists of points or windows, which have any length: in calls of one size, on all cores, block by block."""
 
 import functools
+import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int
 
@@ -48,18 +50,21 @@ def in_calls(
 #: Programs that were used last, by function, options, and the types of all arguments.
 _PROGRAMS: OrderedDict[Any, Callable[..., Any]] = OrderedDict()
 _MOST_PROGRAMS = 64
+_COMPILING = threading.Lock()
 
 
 def _program(function: Any, arguments: tuple[Any, ...], static: dict[str, Any]) -> Callable[..., Any]:
     """The function, compiled for such arguments before any thread calls it: no two of them may compile at once."""
     leaves, structure = jax.tree.flatten(arguments)
-    key = function, tuple(static.items()), structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-    if key not in _PROGRAMS:
-        _PROGRAMS[key] = function.lower(*arguments, **static).compile()
-    _PROGRAMS.move_to_end(key)
-    while len(_PROGRAMS) > _MOST_PROGRAMS:
-        _PROGRAMS.popitem(last=False)
-    return _PROGRAMS[key]
+    types = tuple((jnp.shape(leaf), jnp.result_type(leaf), getattr(leaf, "sharding", None)) for leaf in leaves)
+    key = function, tuple(static.items()), structure, types
+    with _COMPILING:
+        if key not in _PROGRAMS:
+            _PROGRAMS[key] = function.lower(*arguments, **static).compile()
+        _PROGRAMS.move_to_end(key)
+        while len(_PROGRAMS) > _MOST_PROGRAMS:
+            _PROGRAMS.popitem(last=False)
+        return _PROGRAMS[key]
 
 
 def by_block(function: Callable[[Any], Any], block: int, *arguments: Any) -> Any:
@@ -72,13 +77,13 @@ def by_block(function: Callable[[Any], Any], block: int, *arguments: Any) -> Any
 
 
 def covered_pixels(covered: Bool[np.ndarray, "h w n"]) -> Int[np.ndarray, " p"]:
-    """The pixels where anything is, in the order of `_screen_order`."""
-    order = _screen_order(*covered.shape[:2])
+    """The pixels where anything is, in the order of `screen_order`."""
+    order = screen_order(*covered.shape[:2])
     return order[covered.any(axis=-1).reshape(-1)[order]]
 
 
 @functools.lru_cache(maxsize=4)
-def _screen_order(height: int, width: int) -> Int[np.ndarray, " p"]:
+def screen_order(height: int, width: int) -> Int[np.ndarray, " p"]:
     """All pixels, tile by tile of 16 x 16, in blocks of 8 x 4: neighbours in a list look alike."""
     y, x = np.mgrid[:height, :width]
     keys = (x % 8, y % 4, x // 8 % 2, y // 4 % 4, x // 16, y // 16)

@@ -1,6 +1,7 @@
 """The whole way of adaptive supersampling: against the reference, a larger picture, and other sources."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from jaxrender.deferred import (
     QuadBudget,
     SampleMetrics,
     Uniform,
+    canvas,
     draw_gbuffer,
     fit_budget,
     fit_psnr,
@@ -137,7 +139,7 @@ def test_more_scale_is_more_samples_and_less_error(view, reference):
     assert shares == sorted(shares) and errors == sorted(errors, reverse=True)
 
 
-@pytest.mark.parametrize("strategy", ["masked", "per_count", "sorted"])
+@pytest.mark.parametrize("strategy", ["tiled", "masked", "per_count", "sorted"])
 def test_strategies_make_one_image(view, strategy):
     same(
         shade_adaptive(*view, method=SampleMetrics(), strategy=strategy), shade_adaptive(*view, method=SampleMetrics())
@@ -231,6 +233,64 @@ def test_a_second_look_from_the_same_place_shades_less_again(view, reference, me
     with pytest.raises(ValueError, match="previous: expected a picture of"):
         other = dataclasses.replace(one, evidence=one.evidence[:4])
         shade_adaptive(*view, method=method, previous=other)
+
+
+@pytest.mark.parametrize("method", [Clusters(), SampleMetrics()], ids=["clusters", "printed"])
+def test_a_film_of_one_picture_settles(view, reference, method):
+    """What a frame cannot measure, because it shades finely, must not be forgotten and found again in turns."""
+    film = [shade_adaptive(*view, method=method)]
+    for _ in range(11):
+        film.append(shade_adaptive(*view, method=method, previous=film[-1]))
+    quality = [picture_psnr(picture, reference) for picture in film]
+    assert min(quality[1:]) > quality[0] - 0.5
+    last = [picture.count for picture in film[-4:]]
+    moved = [np.mean(a != b) for a, b in itertools.pairwise(last)]
+    assert max(moved) < 0.05, moved
+    assert film[-1].num_shaded < 1.1 * film[-1].count.sum()
+
+
+@pytest.fixture
+def nans_are_meant():
+    """In all threads, unlike `jax.debug_nans`."""
+    jax.config.update("jax_debug_nans", False)
+    yield
+    jax.config.update("jax_debug_nans", True)
+
+
+@pytest.mark.usefixtures("nans_are_meant")
+def test_what_is_not_a_number_stays_where_it_is(scene, camera):
+    """One covered sub-sample of a G-buffer has lost its depth, its normal, and its position."""
+    gbuffer = draw_gbuffer(scene, see(scene, camera, samples=ordered_grid(3), **SIZE))
+    y, x = np.argwhere(np.asarray(gbuffer.coverage).all(axis=-1))[40]
+    spoilt = dataclasses.replace(
+        gbuffer, depth=gbuffer.depth.at[y, x, 2].set(jnp.nan), normal=gbuffer.normal.at[y, x, 2].set(jnp.nan),
+        position=gbuffer.position.at[y, x, 2].set(jnp.nan),
+    )  # fmt: skip
+    _, lighting = scene_view(scene, camera, size=1, height=4, width=4)
+    lighting = dataclasses.replace(lighting, textures=None, slots=())
+    far_away = np.hypot(*np.ogrid[-y : SIZE["height"] - y, -x : SIZE["width"] - x]) > 2.0
+    for method in (Clusters(), SampleMetrics(), Uniform(2)):
+        whole, holed = (
+            shade_adaptive(gbuffer_view(g, scene.material, size=3), lighting, method=method) for g in (gbuffer, spoilt)
+        )
+        np.testing.assert_allclose(holed.image[far_away], whole.image[far_away], atol=1e-5)
+        np.testing.assert_array_equal(holed.count[far_away], whole.count[far_away])
+        assert np.isfinite(holed.image[far_away]).all() and holed.count[y, x] >= 1
+
+
+def test_large_pictures_are_listed_in_pieces(view, reference, monkeypatch):
+    monkeypatch.setattr(canvas, "SUBSAMPLES_AT_ONCE", 9 * 500)
+    same(supersample(*view), reference)
+
+
+def test_settings_that_mean_nothing_are_refused(view):
+    for method, name in ((Clusters(scale=float("nan")), "Clusters.scale"), (SampleMetrics(depth=-1.0), "depth")):
+        with pytest.raises(ValueError, match=rf"{name}: expected a number >= 0"):
+            shade_adaptive(*view, method=method)
+    with pytest.raises(ValueError, match="method: expected Clusters or SampleMetrics, got Uniform"):
+        fit_budget(*view, Uniform(2), budget=0.5)
+    with pytest.raises(ValueError, match="fewer than 2\\^31 sub-samples"):
+        scene_view(None, None, height=16384, width=16384, size=3)
 
 
 def test_least_is_a_floor(view):

@@ -133,7 +133,7 @@ def test_the_readme_examples_run_as_printed(run, monkeypatch):
     assert read_exr(run / "gbuffer.exr", layer="normal").shape == (36, 48, 3)
     exec(adaptive, names)
     assert names["picture"].image.shape == names["next_frame"].image.shape == (36, 48, 3)
-    assert names["picture"].sample_share <= 0.2
+    assert names["first"].sample_share <= 0.2
     exec(relit, names)
     positions, colors = np.asarray(names["positions"]), np.asarray(names["colors"])
     assert positions.shape == colors.shape == (3273, 3)
