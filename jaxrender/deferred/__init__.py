@@ -80,6 +80,7 @@ from jaxrender.deferred.sampling import ShadingPoints as ShadingPoints
 from jaxrender.deferred.sampling import cluster_points as cluster_points
 from jaxrender.deferred.sampling import index_matrix as index_matrix
 from jaxrender.deferred.sampling import prefix_points as prefix_points
+from jaxrender.deferred.sampling import resolve_samples as resolve_samples
 from jaxrender.deferred.shade import Surface as Surface
 from jaxrender.deferred.shade import look_up_surface as look_up_surface
 from jaxrender.deferred.shade import shade as shade

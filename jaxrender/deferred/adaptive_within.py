@@ -14,7 +14,7 @@ from jaxrender.deferred.clusters import Clusters, cluster_samples, is_uneven, sh
 from jaxrender.deferred.fxaa import luma
 from jaxrender.deferred.metrics import shading_steps
 from jaxrender.deferred.point_shading import TAPS, Lighting, shade_points
-from jaxrender.deferred.sampling import cluster_points, first_sample
+from jaxrender.deferred.sampling import cluster_points, first_sample, resolve_samples
 from jaxrender.deferred.subsamples import SubSamples
 from jaxrender.srgb import encode_srgb
 
@@ -82,7 +82,6 @@ def _resolved(
     alone = jnp.sum(owners == sample[:, None], axis=-1) == 1
     exact, *_ = shade_points(samples, lighting, place, points)
     wide, detail, _ = shade_points(samples, lighting, place, points, taps=TAPS)
-    radiance = jnp.where(alone[:, None], exact, wide) * points.weight[:, None]
-    values = jnp.concatenate([radiance, (jnp.where(alone, 0.0, detail) * points.weight)[:, None]], axis=-1)
-    sums = jax.ops.segment_sum(jnp.where(used[:, None], values, 0.0), pixel, num_segments=num_pixels)
+    values = jnp.concatenate([jnp.where(alone[:, None], exact, wide), jnp.where(alone, 0.0, detail)[:, None]], axis=-1)
+    sums = resolve_samples(values, points.weight, jnp.where(used, pixel, num_pixels), num_pixels=num_pixels)
     return sums[:, :3], sums[:, 3]

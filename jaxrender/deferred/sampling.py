@@ -1,7 +1,7 @@
 """Counts or clusters of each pixel -> which sub-samples are shaded, where, and how much each of them counts.
 
 Pointwise over windows: the n = m x m sub-samples of a pixel are an axis, row by row from the upper left. Nothing here
-has a gradient.
+has a gradient but `resolve_samples`, which takes lists.
 """
 
 import functools
@@ -166,6 +166,18 @@ def cluster_points(owner: Int[Array, "*b n"], sample: Int[Array, "*b"]) -> Shadi
         shift=jnp.stack([mean_x, mean_y], axis=-1) - here,
         spread=jnp.where((count == 1.0)[..., None], own, spread),
     )
+
+
+def resolve_samples(
+    values: Float[Array, "b c"], weight: Float[Array, " b"], pixel: Int[Array, " b"], *, num_pixels: int
+) -> Float[Array, "p c"]:
+    """Σ w v over the samples of each pixel, in any order; 0 for a pixel without. Differentiable in values and weights.
+
+    Args:
+      values: radiance, or whatever is averaged.
+      pixel: whose sample each one is; out of range for one that is nobody's.
+    """
+    return jax.ops.segment_sum(values * weight[:, None], pixel, num_segments=num_pixels)
 
 
 def window_size(n: int) -> int:

@@ -28,6 +28,7 @@ from jaxrender.deferred import (
     render_adaptive,
     render_scene,
     render_supersampled,
+    resolve_samples,
     scene_material_textures,
     scene_textures,
     scene_view,
@@ -276,6 +277,18 @@ def test_what_is_not_a_number_stays_where_it_is(scene, camera):
         np.testing.assert_allclose(holed.image[far_away], whole.image[far_away], atol=1e-5)
         np.testing.assert_array_equal(holed.count[far_away], whole.count[far_away])
         assert np.isfinite(holed.image[far_away]).all() and holed.count[y, x] >= 1
+
+
+def test_lists_are_summed_as_the_kernel_does(view, rng):
+    """What the canvas adds up in order of rows is `resolve_samples`."""
+    drawn = canvas.Canvas(*view, np.asarray(view[0].covered))
+    pixel = rng.permutation(36 * 48)[:50].astype(np.int32)
+    row = np.sort(rng.integers(0, 50, 300))
+    radiance, weight = rng.uniform(0, 2, (300, 3)).astype(np.float32), rng.uniform(0, 1, 300).astype(np.float32)
+    drawn.put(pixel, row, radiance, weight)
+    arrays = jnp.asarray(radiance), jnp.asarray(weight), jnp.asarray(pixel[row])
+    np.testing.assert_allclose(drawn.image, resolve_samples(*arrays, num_pixels=36 * 48), atol=1e-5)
+    np.testing.assert_array_equal(drawn.count, np.bincount(pixel[row], minlength=36 * 48))
 
 
 def test_large_pictures_are_listed_in_pieces(view, reference, monkeypatch):

@@ -237,7 +237,16 @@ def _clusters() -> list[Case]:
 
 def _cones() -> list[Case]:
     windows = {"normal": _normals(5, 9, bend=0.5), "covered": _covered(5, 9)}
-    return [Case("deferred.metrics.normal_cone", windows, gradients=("normal",), on={"normal": "sphere"})]
+    listed = {
+        "values": _rng.uniform(0, 2, (30, 3)),
+        "weight": _rng.uniform(0, 1, 30),
+        "pixel": _rng.integers(0, 9, 30).astype(np.int32),  # 7 and 8 are nobody's
+        "num_pixels": 7,
+    }
+    return [
+        Case("deferred.metrics.normal_cone", windows, gradients=("normal",), on={"normal": "sphere"}),
+        Case("deferred.sampling.resolve_samples", listed, gradients=("values", "weight")),
+    ]
 
 
 def _quads() -> list[Case]:

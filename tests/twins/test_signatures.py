@@ -84,6 +84,7 @@ COMPARED_APART = {
     "deferred.sampling.first_sample": "in tests/twins/test_adaptive.py",
     "deferred.sampling.prefix_points": "in tests/twins/test_adaptive.py",
     "deferred.sampling.cluster_points": "in tests/twins/test_adaptive.py",
+    "deferred.sampling.resolve_samples": "in tests/twins/test_adaptive.py",
     "deferred.sampling.index_matrix": "in tests/twins/test_adaptive.py",
     "deferred.clusters.cluster_samples": "in tests/twins/test_adaptive.py",
     "deferred.clusters.cluster_quads": "in tests/twins/test_adaptive.py",

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchref._precision import in_float64
+
 _PRINTED = {2: "02 31", 3: "263 508 174", 4: "182a c4e6 3b09 f7d5"}
 
 
@@ -117,6 +119,18 @@ def cluster_points(owner: Int[Tensor, "*b n"], sample: Int[Tensor, "*b"]) -> Sha
     weight, shift, spread = (torch.stack(values) for values in zip(*found, strict=True))
     lead = tuple(sample.shape)
     return _points(weight.reshape(lead), shift.reshape(*lead, 2), spread.reshape(*lead, 3))
+
+
+@in_float64
+def resolve_samples(
+    values: Float[Tensor, "b c"], weight: Float[Tensor, " b"], pixel: Int[Tensor, " b"], *, num_pixels: int
+) -> Float[Tensor, "p c"]:
+    """Each pixel's weighted samples, added up one by one."""
+    rows = [torch.zeros_like(values[0]) for _ in range(num_pixels)]
+    for value, share, owner in zip(values, weight, pixel.tolist(), strict=True):
+        if 0 <= owner < num_pixels:
+            rows[owner] = rows[owner] + share * value
+    return torch.stack(rows)
 
 
 def _points(weight: Tensor, shift: Tensor, spread: Tensor) -> ShadingPoints:
