@@ -44,6 +44,8 @@ from jaxrender.io.layer_names import known_layers
 from jaxrender.scene import whole_scene_camera
 
 SIZE = {"height": 36, "width": 48}
+# Where compiling is nearly all of the time.
+QUICKLY = {"xla_backend_optimization_level": 0}
 
 
 @pytest.fixture(scope="module")
@@ -448,7 +450,8 @@ def test_the_pure_form_makes_the_same_picture(view):
     np.testing.assert_array_equal(count, expected.count)
     np.testing.assert_allclose(image, expected.image, atol=2e-4)
     np.testing.assert_allclose(alpha, expected.alpha, atol=1e-6)
-    *_, wanted = draw(*view, capacity=100, method=Clusters())
+    small = jax.jit(shade_adaptive_within, static_argnames=("capacity", "method"), compiler_options=QUICKLY)
+    *_, wanted = small(*view, capacity=100, method=Clusters())
     assert int(wanted) > 100
 
 
@@ -461,10 +464,11 @@ def test_gradients_to_the_light_are_finite_differences(view):
         return jnp.mean(shade_adaptive_within(samples, lit, 12_000, method=Clusters(contrast=0.0, detail=0.0))[0])
 
     intensity = lighting.lights.intensity
-    slope = jax.jit(jax.grad(total))(intensity)
+    slope = jax.jit(jax.grad(total), compiler_options=QUICKLY)(intensity)
+    total = jax.jit(total, compiler_options=QUICKLY)
     step = 0.05 * jnp.ones_like(intensity)
     # Light is linear in intensity, so differences are exact but for rounding.
-    expected = (jax.jit(total)(intensity + step) - jax.jit(total)(intensity - step)) / 2.0
+    expected = (total(intensity + step) - total(intensity - step)) / 2.0
     np.testing.assert_allclose(jnp.sum(slope * step), expected, rtol=1e-3)
 
 
@@ -477,6 +481,7 @@ def test_batches_by_vmap(view):
         lit: Lighting = dataclasses.replace(lighting, lights=lights)
         return shade_adaptive_within(samples, lit, 12_000, method=Clusters())[0]
 
-    batch = jax.jit(jax.vmap(draw))(scales)
+    batch = jax.jit(jax.vmap(draw), compiler_options=QUICKLY)(scales)
+    draw = jax.jit(draw, compiler_options=QUICKLY)
     for scale, image in zip(scales, batch, strict=True):
-        np.testing.assert_allclose(image, jax.jit(draw)(scale), atol=1e-4)
+        np.testing.assert_allclose(image, draw(scale), atol=1e-4)
