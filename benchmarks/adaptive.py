@@ -38,7 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from benchmarks.raster import SPONZA
+from benchmarks.raster import SPONZA, point_lights
 from benchmarks.suites import Measurement, Options
 from benchmarks.timing import measure_alternating
 from jaxrender import console
@@ -49,6 +49,7 @@ from jaxrender.deferred.by_quads import QuadBudget
 from jaxrender.deferred.canvas import AdaptiveImage
 from jaxrender.deferred.clusters import Clusters
 from jaxrender.deferred.fxaa import fxaa
+from jaxrender.deferred.gbuffer import rows_per_band
 from jaxrender.deferred.metrics import SampleMetrics, balanced_counts
 from jaxrender.deferred.mlaa import mlaa
 from jaxrender.deferred.pipeline import scene_material_textures
@@ -63,7 +64,7 @@ from jaxrender.io import load_scene
 from jaxrender.io.builtin_scene import builtin_scene
 from jaxrender.machine import keep_xla_to_one_thread
 from jaxrender.metrics import flip, mse, psnr
-from jaxrender.scene import POINT, Lights, Scene, scene_bounds, whole_scene_camera
+from jaxrender.scene import Lights, Scene, scene_bounds, whole_scene_camera
 from jaxrender.srgb import encode_srgb
 
 Params = dict[str, str | int | float | bool]
@@ -167,13 +168,7 @@ class Place:
         rng = np.random.default_rng(self.seed)
         position, color = rng.uniform(*self.box, (number, 3)), rng.uniform(0.6, 1.0, (number, 3))
         intensity = color * TOTAL_INTENSITY * self.scale**2 / max(number, FEWEST_LIGHTS)
-        one = jnp.ones(number, jnp.float32)
-        return Lights(
-            kind=jnp.full(number, POINT, jnp.int32), intensity=jnp.asarray(intensity, jnp.float32),
-            position=jnp.asarray(position, jnp.float32),
-            direction=jnp.tile(jnp.asarray([[0.0, 0.0, -1.0]], jnp.float32), (number, 1)),
-            range=one * jnp.inf, cos_inner=-one, cos_outer=-one,
-        )  # fmt: skip
+        return point_lights(position, intensity)
 
 
 def open_place(*, builtin: bool, seed: int) -> Place:
@@ -261,6 +256,11 @@ class Shot:
     num_pixels: int
     count: Int[np.ndarray, "h w"]
 
+    @property
+    def sample_share(self) -> float:
+        """As of `AdaptiveImage`."""
+        return self.num_shaded / max(self.num_covered, 1)
+
 
 Shots = dict[str, Shot]
 
@@ -284,7 +284,7 @@ def _filtered(encoded_filter: Callable[[Array], Array]) -> Callable[..., Shot]:
 def _uniformly(samples: SubSamples, lighting: Lighting, shots: Shots) -> Shot:
     """With the balanced count that is nearest to what the printed metrics shaded."""
     n = samples.depth.shape[-1]
-    wanted = n * _share(shots["printed"])
+    wanted = n * shots["printed"].sample_share
     count = min(balanced_counts(window_size(n))[:-1], key=lambda k: abs(k - wanted))
     return show(shade_adaptive(samples, lighting, method=Uniform(count)))
 
@@ -292,19 +292,15 @@ def _uniformly(samples: SubSamples, lighting: Lighting, shots: Shots) -> Shot:
 def _by_quads(samples: SubSamples, lighting: Lighting, shots: Shots) -> Shot:
     """With as many samples as the printed metrics shaded, the same in each quad."""
     n = samples.depth.shape[-1]
-    count = min(max(4, round(4 * n * _share(shots["printed"]))), 4 * n - 1)
+    count = min(max(4, round(4 * n * shots["printed"].sample_share)), 4 * n - 1)
     return show(shade_adaptive(samples, lighting, method=QuadBudget(count)))
-
-
-def _share(shot: Shot) -> float:
-    return shot.num_shaded / max(shot.num_covered, 1)
 
 
 def _reconstructed(samples: SubSamples, lighting: Lighting, shots: Shots) -> Shot:
     """One sample of each pixel is shaded, and spread by SRAA."""
     height, width, n = samples.depth.shape
     drawn = shade_adaptive(samples, lighting, method=Uniform(1))
-    band = min(height, max(1, (1 << 17) // (width * n)))
+    band = rows_per_band(height, width * n, times=4)
     rows = functools.partial(_sraa_rows, samples, drawn.image, num_rows=band, size=window_size(n))
     image = in_bands(lambda start: rows(np.int32(start)), band_starts(height, band), height=height)
     return show(dataclasses.replace(drawn, image=image))
@@ -526,10 +522,11 @@ def _strategies(place: Place, sizes: Sizes) -> Iterator[Measurement]:
     plain = drawn["compacted"]
     for strategy, timing in timings.items():
         equal = np.array_equal(drawn[strategy].image, plain.image)
+        paid = _lanes_paid(drawn[strategy].count, strategy)
         numbers = {
             "sample_share": drawn[strategy].sample_share,
-            "predicted_ratio": _lanes_paid(drawn[strategy].count, strategy) / max(int(plain.count.sum()), 1),
-            "predicted_gain": plain.num_covered / max(_lanes_paid(drawn[strategy].count, strategy), 1),
+            "predicted_ratio": paid / max(int(plain.count.sum()), 1),
+            "predicted_gain": plain.num_covered / max(paid, 1),
             "measured_ratio": timing.ms_median / timings["compacted"].ms_median,
             "mse_to_compacted": judge(show(drawn[strategy]), show(plain))["mse"],
         }

@@ -146,7 +146,7 @@ def draw_flight(place: Place, sizes: Sizes, path: Path) -> Found:
     for frame in range(sizes.flight_frames):
         camera = place.flight(frame / sizes.flight_frames)
         shot = Frames(dataclasses.replace(view, camera=camera), keep=True).by(ADAPTIVE)
-        shares.append(shot.num_shaded / max(shot.num_covered, 1))
+        shares.append(shot.sample_share)
         labels = [f"adaptive, m = {view.size}", f"samples a pixel: {100 * shares[-1]:.0f} % shaded"]
         sheet = contact_sheet([_bytes(shot.image), _count_map(shot.count, view.size**2)], labels=labels)
         film.append(_with_counts_bar(sheet, view.size**2))

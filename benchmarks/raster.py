@@ -94,6 +94,17 @@ def _of_scene(scene, camera, name: str, height: int, width: int, options: Option
         yield from _lights(scene, camera, params, seed=options.seed)
 
 
+def point_lights(position: np.ndarray, intensity: np.ndarray) -> Lights:
+    """Point lights without end; (n, 3) each."""
+    one = jnp.ones(len(position), jnp.float32)
+    return Lights(
+        kind=jnp.full(len(position), POINT, jnp.int32), intensity=jnp.asarray(intensity, jnp.float32),
+        position=jnp.asarray(position, jnp.float32),
+        direction=jnp.tile(jnp.asarray([[0.0, 0.0, -1.0]], jnp.float32), (len(position), 1)),
+        range=one * jnp.inf, cos_inner=-one, cos_outer=-one,
+    )  # fmt: skip
+
+
 def _lights(scene: Scene, camera: Camera, params: Params, *, seed: int) -> Iterator[Measurement]:
     """Point lights spread over the scene; shading only, on one core."""
     height, width = int(params["height"]), int(params["width"])
@@ -103,13 +114,7 @@ def _lights(scene: Scene, camera: Camera, params: Params, *, seed: int) -> Itera
     low, high = (np.asarray(bound) for bound in scene_bounds(scene))
     shaded = jax.jit(shade)
     for number in LIGHTS:
-        one = jnp.ones(number, jnp.float32)
-        lights = Lights(
-            kind=jnp.full(number, POINT, jnp.int32), intensity=jnp.ones((number, 3), jnp.float32),
-            position=jnp.asarray(rng.uniform(low, high, (number, 3)), jnp.float32),
-            direction=jnp.tile(jnp.asarray([[0.0, 0.0, -1.0]], jnp.float32), (number, 1)),
-            range=one * jnp.inf, cos_inner=-one, cos_outer=-one,
-        )  # fmt: skip
+        lights = point_lights(rng.uniform(low, high, (number, 3)), np.ones((number, 3)))
         draw = lambda lights=lights: shaded(gbuffer, surface, lights, camera.eye)  # noqa: E731
         yield Measurement("lights", "jaxrender", measure(draw, min_runs=3).metrics(), {**params, "lights": number})
 

@@ -115,16 +115,14 @@ def _draw_adaptive(options: "Render", scene: Scene, camera: Camera, light: dict[
         method, found = fit_psnr(samples, lighting, method, psnr_db=options.psnr)
     else:
         found = shade_adaptive(samples, lighting, method=method)
-    scale = {"scale": method.scale} if options.method in ("clusters", "printed") else {}
-    console.announce(
-        f"{100.0 * found.sample_share:.1f} % of {found.num_covered} samples shaded"
-        + "".join(f", scale {value:g}" for value in scale.values())
-    )
+    numbers, said = {"sample_share": found.sample_share}, ""
+    if options.method in ("clusters", "printed"):
+        numbers["scale"], said = method.scale, f", scale {method.scale:g}"
+    console.announce(f"{100.0 * found.sample_share:.1f} % of {found.num_covered} samples shaded{said}")
     layers = {
         "": np.concatenate([found.image, found.alpha[..., None]], axis=-1),
         "samplecount": found.count[..., None].astype(np.uint32),
     }
-    numbers = {"sample_share": found.sample_share, **scale}
     return _Picture(found.image, found.alpha, lambda: layers, found.count, options.adaptive**2, numbers)
 
 

@@ -85,7 +85,8 @@ def scene_view(
     """Rasterises a scene: its sub-samples, and what shading them needs. Arguments as in `render_scene`."""
     check_at_least("height", height, 1)
     check_at_least("width", width, 1)
-    _check_size(height, width, size)
+    _check_size(size)
+    _check_room(height, width, size)
     grid = ordered_grid(size)
     textures = scene_material_textures(scene) if textures is None else textures
     fragments = see(
@@ -102,17 +103,21 @@ def scene_view(
 
 def gbuffer_view(gbuffer: GBuffer, material: Material, *, size: int) -> GBufferSamples:
     """The sub-samples of a G-buffer: one with m x m samples a pixel, or one of m times the picture's size."""
-    _check_size(1, 1, size)
+    _check_size(size)
     if gbuffer.depth.shape[-1] != size * size:
         gbuffer = group_samples(gbuffer, size=size)
     height, width, _ = gbuffer.depth.shape
-    _check_size(height, width, size)
+    _check_room(height, width, size)
     return GBufferSamples(material=material, gbuffer=gbuffer)
 
 
-def _check_size(height: int, width: int, size: int) -> None:
+def _check_size(size: int) -> None:
     if not isinstance(size, int) or not 1 <= size <= _LARGEST_SIZE:
         raise ValueError(f"size: expected a whole number from 1 to {_LARGEST_SIZE}, got {size}")
+
+
+def _check_room(height: int, width: int, size: int) -> None:
+    """Places of sub-samples are counted through in int32."""
     if height * width * size * size >= 2**31:
         raise ValueError(
             f"size: expected fewer than 2^31 sub-samples, got {height} x {width} pixels of {size} x {size}"
@@ -129,7 +134,7 @@ def _check_settings(method: Method) -> None:
 
 def supersample(samples: SubSamples, lighting: Lighting) -> AdaptiveImage:
     """Shades every covered sub-sample."""
-    canvas = Canvas(samples, lighting, np.asarray(samples.covered))
+    canvas = Canvas(samples, lighting)
     pixel, n = covered_pixels(canvas.covered), canvas.covered.shape[-1]
     canvas.shade_clusters(pixel, np.where(canvas.windows[pixel], np.arange(n, dtype=np.int8), np.int8(-1)))
     return canvas.result()
@@ -154,7 +159,7 @@ def shade_adaptive(
     counted = isinstance(method, SampleMetrics | Uniform)
     if strategy != "compacted" and not counted:
         raise ValueError(f'strategy: expected "compacted" for {type(method).__name__}, got {strategy}')
-    canvas = Canvas(samples, lighting, np.asarray(samples.covered))
+    canvas = Canvas(samples, lighting)
     evidence = None if previous is None else previous.evidence
     if evidence is not None and evidence.shape != (*canvas.covered.shape[:2], 1 if counted else 2):
         raise ValueError(

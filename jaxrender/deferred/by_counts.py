@@ -6,7 +6,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxrender.deferred.bands import band_starts, in_bands
 from jaxrender.deferred.canvas import Canvas
@@ -99,19 +99,24 @@ def _metric_rows(
     samples, lighting, far, depth_scale, normal_scale, least, start, *, num_rows: int, plane_corrected: bool,
     mapped_normals: bool,
 ) -> Float[Array, "r w"]:  # fmt: skip
-    _, width, n = samples.depth.shape
     cut = lambda values: jax.lax.dynamic_slice_in_dim(values, start, num_rows)  # noqa: E731
-    covered, metric = cut(samples.covered), jnp.full((num_rows, width), least)
+    covered = cut(samples.covered)
+    metric = jnp.full(covered.shape[:2], least)
     if depth_scale is not None:
         by_depth = depth_sample_count(
             cut(samples.depth) / far, scale=depth_scale, covered=covered, plane_corrected=plane_corrected
         )
         metric = jnp.maximum(metric, by_depth)
     if normal_scale is not None:
-        place = start * (width * n) + jnp.arange(num_rows * width * n, dtype=jnp.int32).reshape(covered.shape)
-        normal = _normals(samples, lighting if mapped_normals else None, place)
+        normal = _normals(samples, lighting if mapped_normals else None, _places(start, covered.shape))
         metric = jnp.maximum(metric, normal_sample_count(normal, scale=normal_scale, covered=covered))
     return metric
+
+
+def _places(start: Array, shape: tuple[int, ...]) -> Int[Array, "r w n"]:
+    """Where the sub-samples of rows are in the image, counted through."""
+    rows, width, n = shape
+    return start * (width * n) + jnp.arange(rows * width * n, dtype=jnp.int32).reshape(shape)
 
 
 def _normals(samples: SubSamples, lighting: Lighting | None, place: Array) -> Float[Array, "*b 3"]:
@@ -156,15 +161,13 @@ def _highlight_metric(canvas: Canvas, method: SampleMetrics) -> Float[Array, "h 
 def _highlight_rows(
     samples, lighting, light, roughness, scale, start, *, num_rows: int, mapped_normals: bool
 ) -> Float[Array, "r w"]:
-    _, width, n = samples.depth.shape
     cut = lambda values: jax.lax.dynamic_slice_in_dim(values, start, num_rows)  # noqa: E731
     covered = cut(samples.covered)
-    place = start * (width * n) + jnp.arange(num_rows * width * n, dtype=jnp.int32).reshape(covered.shape)
-    found, _ = samples.look(place)
-    position = jnp.take_along_axis(found.position, first_sample(covered)[..., None, None], axis=-2)[..., 0, :]
+    place = _places(start, covered.shape)
+    first, _ = samples.look(jnp.take_along_axis(place, first_sample(covered)[..., None], axis=-1)[..., 0])
     normal = _normals(samples, lighting if mapped_normals else None, place)
     return highlight_sample_count(
-        normal, position, cut(roughness), cut(light), lighting.lights, lighting.eye, scale=scale, covered=covered
+        normal, first.position, cut(roughness), cut(light), lighting.lights, lighting.eye, scale=scale, covered=covered
     )
 
 

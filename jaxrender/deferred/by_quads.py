@@ -45,8 +45,9 @@ def shade_by_quads(canvas: Canvas, method: QuadBudget) -> None:
     n = canvas.covered.shape[-1]
     if not 4 <= method.count <= 4 * n:
         raise ValueError(f"count: expected a number from 4 to {4 * n}, got {method.count}")
+    quarters = _quarter(n)
     pixel, place = _quad_places(*canvas.covered.shape)
-    covered = canvas.covered.reshape(-1)[place] & (pixel >= 0)[:, _quarter(n)]
+    covered = canvas.covered.reshape(-1)[place] & (pixel >= 0)[:, quarters]
     some = covered.any(axis=1)
     pixel, place, covered = pixel[some], place[some], covered[some]
     scales = tuple(np.float32(v) for v in (method.normal, method.plane, method.apart))
@@ -57,7 +58,7 @@ def shade_by_quads(canvas: Canvas, method: QuadBudget) -> None:
     alone = np.count_nonzero(owners == sample[:, None], axis=1) == 1
     radiance, _, _, _ = canvas.shade(_quad_points, place[quad, sample], alone, owners, sample)
     # What each sample is of each of the four pixels.
-    used = np.stack([(owners[:, _quarter(n) == k] == sample[:, None]).sum(axis=1) for k in range(4)], axis=1)
+    used = np.stack([(owners[:, quarters == k] == sample[:, None]).sum(axis=1) for k in range(4)], axis=1)
     row, quarter = np.nonzero(used)
     own, total = pixel[quad[row], quarter], np.maximum(canvas.windows.sum(axis=1), 1)
     order = np.argsort(own, kind="stable")

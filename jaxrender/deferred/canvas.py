@@ -53,9 +53,9 @@ class Canvas:
       evidence: as in `AdaptiveImage`.
     """
 
-    def __init__(self, samples: SubSamples, lighting: Lighting, covered: Bool[np.ndarray, "h w n"]):
-        self.samples, self.lighting, self.covered = samples, lighting, covered
-        height, width, _ = covered.shape
+    def __init__(self, samples: SubSamples, lighting: Lighting):
+        self.samples, self.lighting, self.covered = samples, lighting, np.asarray(samples.covered)
+        height, width, _ = self.covered.shape
         self.image = np.zeros((height * width, 3), np.float32)
         self.detail, self.roughness = np.zeros((2, height * width), np.float32)
         self.count = np.zeros(height * width, np.int32)

@@ -283,7 +283,7 @@ def test_what_is_not_a_number_stays_where_it_is(scene, camera):
 
 def test_lists_are_summed_as_the_kernel_does(view, rng):
     """What the canvas adds up in order of rows is `resolve_samples`."""
-    drawn = canvas.Canvas(*view, np.asarray(view[0].covered))
+    drawn = canvas.Canvas(*view)
     pixel = rng.permutation(36 * 48)[:50].astype(np.int32)
     row = np.sort(rng.integers(0, 50, 300))
     radiance, weight = rng.uniform(0, 2, (300, 3)).astype(np.float32), rng.uniform(0, 1, 300).astype(np.float32)
