@@ -198,6 +198,88 @@ class Quads(SceneView):
 
 
 @dataclass(frozen=True)
+class Denoise:
+    """Cleans a noisy rendering: an EXR file of any renderer, guided by its normals, depth, albedo and so on.
+
+    Writes the clean picture as EXR with the other layers as they came, as PNG, and a page with before and after. Layers
+    are found by the names that Blender, Mitsuba, Arnold and pbrt give them. Options that name an image take FILE or
+    FILE:LAYER. Direct and indirect light are filtered apart if they add up to the picture.
+    """
+
+    noisy: tyro.conf.Positional[str | None] = None
+    """The noisy picture, FILE or FILE:LAYER. Without one, a noisy picture of a built-in scene."""
+    out: Out = Path("out/denoise.exr")
+    """The clean picture; .png and .html files are written beside it."""
+    color: str | None = None
+    """The noisy picture, as an option."""
+    normal: str | None = None
+    """Normals."""
+    depth: str | None = None
+    """Depth."""
+    position: str | None = None
+    """Positions."""
+    albedo: str | None = None
+    """Albedo: it is divided out while the light is filtered."""
+    ao: str | None = None
+    """Ambient occlusion."""
+    direct: str | None = None
+    """Direct light, albedo included."""
+    indirect: str | None = None
+    """Indirect light, albedo included; the rest of the picture is direct if it is not given."""
+    emission: str | None = None
+    """Light of lamps and background that are seen themselves."""
+    method: Literal["guided", "bilateral", "atrous"] = "guided"
+    """The filter."""
+    radius: int | None = None
+    """Of the filter, in pixels. By default a rule in samples and resolution."""
+    eps: float | None = None
+    """Of the filter: factor on what tells edges from noise. By default a rule."""
+    spp: float | None = None
+    """Samples a pixel of the picture, for those rules. By default as the file says, if it does."""
+    auto: bool = False
+    """Choose radius and eps from the picture alone, by leave-one-out cross-validation; for frames, from the first."""
+    firefly: float | Literal["off"] = 16.0
+    """Pixels brighter than this many times their neighbourhood are clamped to that; off leaves them."""
+    demodulate: bool = True
+    """Divide the albedo out while filtering."""
+    frames: str | None = None
+    """Numbers of frames, such as 1-24 or 1,3,5-7; names then have a place for them, as noisy.####.exr or %04d."""
+    resume: bool = False
+    """With --frames: leave out those whose output is there."""
+    half: bool = False
+    """Store half floats."""
+    exposure_stops: float = 0.0
+    """Brightens PNG and page by powers of two."""
+    json: bool = False
+    """Print one JSON object instead of the list of files."""
+
+    def run(self) -> None:
+        self.check()
+        from jaxrender.denoise_command import run_denoise
+
+        console.enable_compilation_cache()
+        run_denoise(self)
+
+    def check(self) -> None:
+        """Raises ValueError, naming the option; here, and not when made, so that it is told in one line."""
+        if self.noisy is not None and self.color is not None:
+            raise ValueError("--color: expected it alone, got it beside a picture")
+        images = ("normal", "depth", "position", "albedo", "ao", "direct", "indirect", "emission")
+        beside = [name for name in images if getattr(self, name) is not None]
+        if beside and self.noisy is None and self.color is None:
+            raise ValueError(f"--{beside[0]}: expected a noisy picture beside it, got none")
+        if self.resume and self.frames is None:
+            raise ValueError("--resume: expected --frames beside it, got none")
+        if self.radius is not None:
+            check_at_least("--radius", self.radius, 1)
+        for name, value, low in (("eps", self.eps, 0.0), ("spp", self.spp, 0.0), ("firefly", self.firefly, 1.0)):
+            if isinstance(value, float) and not low < value < math.inf:
+                raise ValueError(f"--{name}: expected a finite number above {low:g}, got {value}")
+        if not -64.0 <= self.exposure_stops <= 64.0:
+            raise ValueError(f"--exposure-stops: expected a number from -64 to 64, got {self.exposure_stops}")
+
+
+@dataclass(frozen=True)
 class Doctor:
     """Says what is installed, what it runs on, and what each missing extra would add.
 
@@ -225,7 +307,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"jaxrender {doctor.package_version('jaxrender')}")
         return 0
     description = "Real-time rendering methods as pure tensor kernels."
-    commands = Demo | Render | Quads | Relight | Doctor
+    commands = Demo | Render | Denoise | Quads | Relight | Doctor
     return console.run_command(
         lambda: console.parse(commands, prog="jaxrender", description=description, argv=argv).run()
     )

@@ -13,7 +13,10 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 PACKAGES = ("jaxrender", "torchref", "fitting", "benchmarks")
 
 GROUND = {"scene", "camera", "vecmath", "warp", "brdf", "metrics", "checks", "machine", "srgb", "sh_basis"}
-COMMANDS = {"cli", "console", "doctor", "render_command", "quads_command", "quad_costs"}
+COMMANDS = {
+    "cli", "console", "denoise_command", "denoise_inputs", "denoise_page", "doctor", "quad_costs", "quads_command",
+    "render_command",
+}  # fmt: skip
 
 #: Part of jaxrender -> the other parts it may import. Data runs from the first line to the last.
 MAY_IMPORT: dict[str, set[str]] = {

@@ -79,7 +79,7 @@ def read_exr_layers(path: str | os.PathLike) -> dict[str, Num[np.ndarray, "h w c
                 if pixels is None or pixels.shape != (part.height, part.width):
                     expected = f"{part.height} x {part.width} pixels"
                     checks.bad_input(path, f"channel {name!r}", expected=expected, got=getattr(pixels, "shape", None))
-            for name, members in _group(tuple(channels)).items():
+            for name, members in group_channels(tuple(channels)).items():
                 full = name if index == 0 else f"{part.name}.{name}" if name else part.name
                 layers[full] = _stack([channels[member] for member in members])
     return layers
@@ -146,8 +146,8 @@ def write_exr(
                 raise OSError(code, reason, str(path)) from error
 
 
-def _group(channels: tuple[str, ...]) -> dict[str, list[str]]:
-    """Layer name -> its channels in order."""
+def group_channels(channels: tuple[str, ...]) -> dict[str, list[str]]:
+    """Layer name -> its channels in order: what of a part's channel names is one image ("" for the picture)."""
     groups: dict[str, list[str]] = {}
     rest = sorted(channels)
     for prefix in sorted({name.rpartition(".")[0] for name in rest}):

@@ -1251,12 +1251,103 @@ def _late() -> list[Case]:
     ]  # fmt: skip
 
 
+def _spoiled(image: np.ndarray, *pixels: tuple[int, int], value: float = np.nan) -> np.ndarray:
+    """The image with one channel of some pixels not finite."""
+    spoiled = image.copy()
+    for k, (y, x) in enumerate(pixels):
+        spoiled[y, x, k % image.shape[2]] = value
+    return spoiled
+
+
+def _box_filters() -> list[Case]:
+    room, image = "filters.sat", _uniform(-1.0, 2.0, 6, 7, 2)
+    spoiled = _spoiled(image, (0, 0), (0, 1), (1, 0), (1, 1), (4, 6))
+    infinite = _spoiled(image[..., :1], (3, 3), value=-np.inf)
+    return [
+        # Sums of float32 values up to some ten: rounding of the whole table.
+        Case(f"{room}.summed_area_table", {"image": image}, gradients=("image",), ulps32=LONG_SUM),
+        *(
+            Case(f"{room}.box_sum_from_table", {"table": table, "radius": r}, f"radius {r}", gradients=("table",))
+            for table, r in ((_normal(6, 5, 2), 1), (_normal(4, 6, 1), 9))
+        ),
+        *(
+            Case(f"{room}.{kernel}", {"image": x, "radius": r}, f"{label}, radius {r}", gradients=("image",))
+            for kernel in ("box_mean", "box_variance")
+            for label, x, r in (
+                ("whole", image, 3),
+                ("a corner and a border masked", spoiled, 1),
+                ("infinite", infinite, 40),
+                ("nothing", np.full((2, 3, 1), np.nan), 1),
+            )
+        ),
+    ]
+
+
+def _guided_filter() -> list[Case]:
+    kernel, size = "filters.guided.guided_filter", (7, 9)
+    guide, image = _uniform(0.0, 1.0, *size, 3), _normal(*size, 2)
+    masked = {
+        "guide": _spoiled(guide, (0, 8), (2, 2), (6, 0)),
+        # All that the window of the lower right corner sees, and two pixels more.
+        "image": _spoiled(image, (2, 2), (3, 5), *((y, x) for y in (5, 6) for x in (7, 8)), value=np.inf),
+    }
+    # A whole block of 2 x 2, and one of 3 x 3 at the border.
+    blocks = *((y, x) for y in (9, 10) for x in (6, 7)), *((y, x) for y in (2, 3) for x in (2, 3))
+    odd = {
+        "guide": _spoiled(_uniform(0.0, 1.0, 11, 8, 2), (4, 4), (10, 7)),
+        "image": _spoiled(_normal(11, 8, 1), *blocks),
+    }
+    step = np.where(np.arange(9.0) < 4, 0.2, 0.7) + 0.1 * _normal(*size)
+    own = {"guide": step[..., None], "image": step[..., None]}
+    number, per_channel, per_window = np.array(0.05), np.array([0.02, 0.1, 0.4]), _uniform(0.01, 0.2, *size, 3)
+    by_3, by_2 = {"subsample": 3}, {"subsample": 2}
+    aware, slopes = {"edge_aware": True}, ("guide", "image", "eps")
+    seen = _rng.uniform(size=size) < 0.7
+    planes = {"guide": np.moveaxis(guide, -1, 0), "image": np.moveaxis(image, -1, 0), "valid": seen}
+    return [
+        *(
+            Case(
+                kernel,
+                {**images, "radius": radius, "eps": eps, **options},
+                label,
+                gradients=slopes,
+                ulps32=LONG_SUM,  # differences of moments
+            )
+            for label, images, radius, eps, options in (
+                ("number", {"guide": guide, "image": image}, 2, number, {}),
+                ("masked, per channel", masked, 2, per_channel, {}),
+                ("masked, per window and channel", masked, 1, per_window, {}),
+                ("masked, per window, larger than the image", masked, 20, per_window[..., :1], {}),
+                ("nothing", {"guide": np.full((2, 3, 1), np.nan), "image": np.ones((2, 3, 1))}, 1, number, {}),
+                ("by 3, masked, per channel", odd, 4, per_channel[:2], by_3),
+                ("by 2, masked, per window", odd, 1, _uniform(0.01, 0.2, 11, 8, 2), by_2),
+                ("edge-aware, masked, per channel", masked, 2, per_channel, aware),
+                ("own guide, edge-aware, by 2", own, 3, number, aware | by_2),
+            )
+        ),
+        Case(
+            "filters.guided.filter_planes",
+            {**planes, "eps": per_channel[:, None, None], "radius": 2},
+            gradients=slopes,
+            ulps32=LONG_SUM,
+        ),
+        *(
+            Case("filters.guided.edge_aware_eps", {"guide": x, "eps": eps}, label, gradients=("guide", "eps"))
+            for label, x, eps in (
+                ("masked, per channel", masked["guide"], per_channel),
+                ("per window", own["guide"], per_window[..., :1]),
+            )
+        ),
+        Case("filters.guided.edge_aware_eps", {"guide": np.full((3, 4, 2), 0.3), "eps": 0.1}, "constant"),
+    ]
+
+
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
         _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility,
         _pose_model, _skeleton, _skinning, _camera, _metrics, _scene, _texture, _quads, _warps, _brdf,
-        _whole_scene, _deferred_shading, _late,
+        _whole_scene, _deferred_shading, _late, _box_filters, _guided_filter,
     )
     for case in room()
 )  # fmt: skip

@@ -20,9 +20,12 @@ PAIRED = (
     "vecmath", "camera", "metrics", "scene", "brdf", "harmonics.", "animation.skeleton", "animation.skinning",
     "deferred.samples", "deferred.texture", "deferred.quads", "deferred.warps", "deferred.gbuffer", "deferred.shade",
     "deferred.late", "deferred.metrics", "deferred.sampling", "deferred.clusters", "deferred.fxaa", "deferred.mlaa",
-    "deferred.sraa", "deferred.highlights",
+    "deferred.sraa", "deferred.highlights", "filters.sat", "filters.guided", "filters.valid",
 )  # fmt: skip
-UNPAIRED_MODULES = {"harmonics.pipeline": "the order of the stages, no arithmetic"}
+UNPAIRED_MODULES = {
+    "harmonics.pipeline": "the order of the stages, no arithmetic",
+    "filters.guided_rows": "what a CPU runs for guided_filter; held against filter_planes in tests/filters",
+}
 
 # Public names without a partner, or with another signature.
 EXCEPTIONS = {
@@ -59,6 +62,10 @@ EXCEPTIONS = {
     "deferred.late.draw_late": "a driver: finds fragments and calls the shader; judged in tests/deferred",
     "harmonics.sh.triple_product_tensor": "torchref's way to the product",
     "harmonics.zh.zonal_integral": "torchref integrates where jaxrender has closed forms",
+    "filters.sat.mean_of": "against rounding, which torchref does not feel",
+    "filters.guided.center_of": "the same",
+    "filters.guided.filter_centered": "jaxrender's own way: pieces of an image",
+    "filters.valid.check_images": "a check of shapes",
 }
 
 # Kernels with a partner that are compared in a test of their own.
@@ -96,6 +103,7 @@ COMPARED_APART = {
     "deferred.fxaa.luma_range": "in tests/twins/test_antialiasing.py",
     "deferred.mlaa.mlaa": "in tests/twins/test_antialiasing.py",
     "deferred.sraa.sraa": "in tests/twins/test_antialiasing.py",
+    "filters.valid.valid_pixels": "in tests/twins/test_filters.py",
 }
 
 
