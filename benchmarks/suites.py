@@ -19,6 +19,7 @@ from jaxrender import checks
 SUITES: Mapping[str, str] = MappingProxyType(
     {
         "adaptive": "benchmarks.adaptive",
+        "filters": "benchmarks.filters",
         "harmonics": "benchmarks.harmonics",
         "raster": "benchmarks.raster",
     }

@@ -14,7 +14,7 @@ from jaxrender import console
 from jaxrender.checks import bad_input
 from jaxrender.denoise_inputs import LIGHT, DenoiseInputs, builtin_inputs, read_inputs
 from jaxrender.denoise_page import BeforeAfterPage, add_comparison
-from jaxrender.filters.denoise import Denoised, DenoiseSettings, denoise
+from jaxrender.filters.denoiser import Denoised, DenoiseSettings, denoise
 from jaxrender.io import write_exr, write_png
 from jaxrender.io.aovs import split_reference
 from jaxrender.io.frames import frame_name, has_number, numbered_name, parse_frames, unnumbered_name

@@ -49,7 +49,15 @@ PROMISED = {
         "mse": ("image", "reference"),
         "psnr": ("image", "reference", "*", "peak"),
         "ssim": ("image", "reference", "*", "peak"),
+        "flip": ("image", "reference"),
         "heatmap": ("values",),
+    },
+    "jaxrender.filters": {
+        "summed_area_table": ("image",),
+        "box_mean": ("image", "*", "radius"),
+        "guided_filter": ("guide", "image", "*", "radius", "eps"),
+        "cross_bilateral_filter": ("image", "features", "*", "radius", "sigma_spatial", "sigma_features"),
+        "atrous_filter": ("image", "features", "*", "num_levels", "sigma_features", "sigma_color"),
     },
 }
 
@@ -57,6 +65,7 @@ DEFAULTS = {
     ("jaxrender.harmonics", "phong_operator", "order"): 4,
     ("jaxrender.harmonics", "brdf_operator", "order"): 4,
     ("jaxrender.metrics", "psnr", "peak"): 1.0,
+    ("jaxrender.filters", "atrous_filter", "sigma_color"): None,
 }
 
 MODULES = sorted(m.name for m in pkgutil.walk_packages(jaxrender.__path__, "jaxrender."))

@@ -38,7 +38,7 @@ def calls(monkeypatch):
             parts["emission"] = np.asarray(aovs.emission)
         image = sum(parts.values()) if parts else mean3(aovs.color)
         broken = int((~np.isfinite(aovs.color)).any(axis=-1).sum())
-        counts = {"nan": broken, "negative": 2, "clamped": 3, "filled": broken}
+        counts = {"nan": broken, "negative": 2, "clamped": 3, "filled": broken, "raised": 4}
         return denoise_command.Denoised(
             image, parts, counts, {"method": settings.method, "radius": settings.radius or 5, "eps": 0.5}
         )
@@ -88,7 +88,7 @@ def test_picture_layers_and_files(tmp_path, capsys, rng, calls):
     write_exr(tmp_path / "noisy.exr", layers)
     record = json.loads(run(capsys, tmp_path / "noisy.exr", "-o", tmp_path / "a" / "clean.exr", "--json").out)
     assert record["paths"] == [str(tmp_path / "a" / f"clean.{kind}") for kind in ("exr", "png", "html")]
-    assert record["counts"] == {"nan": 0, "negative": 2, "clamped": 3, "filled": 0}
+    assert record["counts"] == {"nan": 0, "negative": 2, "clamped": 3, "filled": 0, "raised": 4}
     assert record["chosen"]["radius"] == 5 and record["separate"] == []
     assert record["layers"] == {
         "color": "noisy.exr: RGB", "normal": "noisy.exr: N", "depth": "noisy.exr: Z", "albedo": "noisy.exr: albedo",
@@ -225,7 +225,8 @@ def test_broken_pixels_are_counted_on_standard_error(tmp_path, capsys, rng, call
     layers[""][2, 3, 0], layers[""][4, 5] = np.nan, np.inf
     write_exr(tmp_path / "noisy.exr", layers)
     out, err = run(capsys, tmp_path / "noisy.exr", "-o", tmp_path / "clean.exr")
-    assert "noisy.exr: of the pixels 2 NaN or Inf, 2 negative, 3 clamped as fireflies, 2 filled in\n" in err
+    told = "2 NaN or Inf, 2 negative, 3 clamped as fireflies, 2 filled in, 4 below 0 after the filter and set to 0"
+    assert f"noisy.exr: of the pixels {told}\n" in err
     assert "noisy.exr: method guided, radius 5, eps 0.5\n" in err
     assert out.splitlines() == [f"wrote {tmp_path / 'clean'}.{kind}" for kind in ("exr", "png", "html")]
 

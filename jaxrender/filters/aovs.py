@@ -39,7 +39,7 @@ class Aovs:
     ao: Float[np.ndarray | Array, "h w k"] | None = None
 
     def check(self) -> None:
-        """Raises ValueError, naming the field, if shapes do not fit together or one of direct and indirect is missing."""
+        """Raises ValueError, naming the field, if shapes do not fit together or direct or indirect is alone."""
         height_width = np.shape(self.color)[:2]
         for name, image in self.given().items():
             num_channels = image.shape[-1] if name == "ao" and image.ndim == 3 else 1 if name in _SINGLE else 3

@@ -82,7 +82,7 @@ def atrous_filter(
         if color_scale is not None:
             likenesses.append(Likeness(tuple(colors), jnp.full(channels, color_scale * growth), gives))
         values = [jnp.where(gives, v, 0.0) for v in (*colors, jnp.ones_like(colors[0]))]
-        around = pair_sums(values, likenesses, offsets, log_taps, reach)
+        around = pair_sums(values, likenesses, offsets, log_taps, reach=reach)
         own = [*colors, has_value.astype(dtype)]
         return weighted_mean([o + a for o, a in zip(own, around, strict=True)]), None
 

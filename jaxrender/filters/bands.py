@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from jaxrender import checks
 from jaxrender.filters.guided import filter_centered
 from jaxrender.filters.guided_rows import restart_rows
+from jaxrender.filters.precision import working
 from jaxrender.machine import num_cores, on_all_cores
 
 
@@ -67,14 +68,19 @@ def guided_filter_in_bands(
       eps: one number, or one per guide channel.
       rows: of a band; rounded up to where running sums start afresh. By default the image is cut into one band per
         core.
+    Raises:
+      ValueError: if guide and image differ in height or width, rows < 1, or radius or the shape of eps do not fit.
     """
+    if guide.shape[:2] != image.shape[:2]:
+        raise ValueError(f"guide and image: expected one height and width, got {guide.shape} and {image.shape}")
     step = restart_rows(min(radius, image.shape[0] - 1))
     if rows is None:
         rows = -(-image.shape[0] // num_cores())
     checks.check_at_least("rows", rows, 1)
     rows = -(-rows // step) * step
-    centers = [jnp.asarray(center) for center in _centers(guide, image, rows)]
-    ridge = jnp.asarray(eps, jnp.float32)
+    dtype = working(jnp.asarray(np.asarray(image[:1])).dtype)
+    centers = [jnp.asarray(center, dtype) for center in _centers(guide, image, rows)]
+    ridge = jnp.asarray(eps, dtype)
     function = jax.jit(partial(_band, radius=radius))
     return in_bands(lambda a, b: function(a, b, *centers, ridge), (guide, image), rows=rows, halo=(2 * step, step))
 

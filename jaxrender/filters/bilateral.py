@@ -139,6 +139,7 @@ def pair_sums(
     likenesses: Sequence[Likeness],
     offsets: np.ndarray | Int[Array, "k"],
     log_weights: Float[Array, "k"],
+    *,
     reach: int | None = None,
 ) -> list[Float[Array, "n"]]:
     """Sums over the neighbours at p ± offset, Σ w v, of planes of values v; p itself is not one of them.

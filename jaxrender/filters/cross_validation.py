@@ -48,4 +48,4 @@ def leave_one_out_error(
     error = (image - filtered) / (1.0 - share)[..., None]
     finite = jnp.isfinite(error)
     error = jnp.where(finite, error, jnp.zeros_like(error))
-    return jnp.sum(weight * error * error) / jnp.sum(weight * finite)
+    return jnp.sum(weight * error * error) / jnp.sum(weight * finite.astype(weight.dtype))

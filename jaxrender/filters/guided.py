@@ -45,7 +45,7 @@ def guided_filter(
     precision is computed in float32; the result has the image's dtype.
 
     Differentiable in guide, image and eps, by a rule of its own that keeps only the arguments and makes about
-    3 (g + 1) (g + c + 1) planes on the way back.
+    5 (g + 1) (g + c + 1) planes on the way back.
 
     Args:
       radius: in pixels, >= 0; may exceed the image.

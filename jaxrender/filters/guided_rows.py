@@ -57,7 +57,7 @@ def filter_rows(
 
     def fetch(place, y):
         at = jnp.clip(y, 0, height - 1)
-        weight = (valid[at] & inside(y)).astype(guide.dtype)[None]
+        weight = (_row(valid, at) & inside(y)).astype(guide.dtype)[None]
         for start, row in ((0, weight), (1, _row(guide, at) * weight), (n, _row(image, at) * weight)):
             place = lax.dynamic_update_slice(place, row, (start, reach_x))
         return place
@@ -82,9 +82,9 @@ def filter_rows(
         return jnp.where((jnp.arange(n) == j)[:, None, None], line[None], others)
 
     def step(t, walk: _Walk, first) -> _Walk:
-        """Row t, of which sums from row `first` on know all rows above but the ones that leave the window with it."""
-        gone = jnp.where(t == first, -1, t - length)
-        rows = fetch(walk.rows[0], t + reach_y), fetch(walk.rows[1], jnp.where(t == first, -1, t - reach_y - 1))
+        """Does row t, in a block that began at row `first`; sums that start afresh have no row to let go of."""
+        leaving, gone = (jnp.where(t == first, -1, t - 1 - rows) for rows in (reach_y, 2 * reach_y))
+        rows = fetch(walk.rows[0], t + reach_y), fetch(walk.rows[1], leaving)
         sums = walk.sums + (products(rows[0]) - products(rows[1]))
         stages = [_put(walk.stages[0], window_sums(sums), t)]
         pixels = jnp.maximum(stages[0][0, 0], jnp.ones_like(counts_x))
@@ -105,7 +105,7 @@ def filter_rows(
     every = restart_rows(reach_y)
 
     def block(k, walk: _Walk) -> _Walk:
-        """The steps up to the next restart. Sums start with a row less than a window has: no row leaves at first."""
+        """The steps up to the next restart."""
         start = k * every
 
         def add(i, state):
@@ -137,10 +137,10 @@ def filter_rows(
     return jnp.swapaxes(result, 0, 1)
 
 
-def _row(planes: Float[Array, "*b h w"], y) -> Float[Array, "*b w"]:
+def _row(planes: Array, y) -> Array:
     return lax.dynamic_index_in_dim(planes, y, axis=-2, keepdims=False)
 
 
 def _put(place: Float[Array, "n+1 _ w"], value: Float[Array, "n _ w"], t) -> Float[Array, "n+1 _ w"]:
-    """`value` in all but the last entry of `place`: at 0, which the compiler cannot know, so that it has to store it."""
+    """`value` in all but the last entry of `place`: at 0, which the compiler cannot know, so it has to store it."""
     return lax.dynamic_update_slice(place, value, (jnp.minimum(t, 0), 0, 0))

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 def working(dtype: DTypeLike) -> np.dtype:
     """float32 for half precision, else the dtype itself."""
-    return jnp.promote_types(dtype, jnp.float32) if jnp.finfo(dtype).bits < 32 else jnp.dtype(dtype)
+    return jnp.dtype(jnp.float32 if jnp.finfo(dtype).bits < 32 else dtype)
 
 
 def planes_of(image: Float[Array, "h w c"]) -> Float[Array, "c h w"]:

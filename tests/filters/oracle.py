@@ -21,12 +21,11 @@ def of_windows(image: np.ndarray, radius: int, function: Callable[[np.ndarray], 
 
 
 def window_sums(plane: np.ndarray, radius: int, rows: np.ndarray) -> np.ndarray:
-    """Sums of windows in some rows of a large plane, from a table in float64."""
-    height, width = plane.shape
-    table = np.pad(plane.astype(np.float64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
-    x = np.arange(width)
-    bands = table[np.minimum(rows + radius + 1, height)] - table[np.maximum(rows - radius, 0)]
-    return bands[:, np.minimum(x + radius + 1, width)] - bands[:, np.maximum(x - radius, 0)]
+    """Sums of the windows around some rows of a large plane: of columns one by one, then a running sum in float64."""
+    width, x = plane.shape[1], np.arange(plane.shape[1])
+    columns = [plane[max(y - radius, 0) : y + radius + 1].sum(0, dtype=np.float64) for y in rows]
+    running = np.pad(np.cumsum(columns, axis=1), ((0, 0), (1, 0)))
+    return running[:, np.minimum(x + radius + 1, width)] - running[:, np.maximum(x - radius, 0)]
 
 
 def guided_filter(guide: np.ndarray, image: np.ndarray, *, radius: int, eps) -> np.ndarray:

@@ -1342,12 +1342,92 @@ def _guided_filter() -> list[Case]:
     ]
 
 
+def _pair_filters() -> list[Case]:
+    size = (6, 7)
+    image, features = _normal(*size, 2), _uniform(0.0, 1.0, *size, 3)
+    masked = {
+        "image": _spoiled(image, (0, 0), (3, 3), (5, 6)),
+        "features": _spoiled(features, (3, 3), (4, 1), value=np.inf),
+    }
+    whole = {"image": image, "features": features}
+    number, each = np.array(0.6), np.array([0.4, 0.9, 0.6])
+    slopes = ("image", "features", "sigma_features")
+    # A firefly beside dark pixels, and one that is its own median.
+    sparse = np.where(_rng.uniform(size=size) < 0.7, _uniform(0.1, 1.0, *size), 0.0)[..., None] * _uniform(0.5, 1, 3)
+    sparse[2, 3] *= 60.0
+    return [
+        *(
+            Case(
+                "filters.bilateral.cross_bilateral_filter",
+                {**images, "radius": radius, "sigma_spatial": np.array(1.5), "sigma_features": sigma},
+                label,
+                gradients=(*slopes, "sigma_spatial"),
+            )
+            for label, images, radius, sigma in (
+                ("number", whole, 2, number),
+                ("masked, per feature", masked, 1, each),
+                ("masked, larger than the image", masked, 9, number),
+            )
+        ),
+        *(
+            Case(
+                "filters.atrous.atrous_filter",
+                {**images, "num_levels": levels, "sigma_features": sigma, **color},
+                label,
+                gradients=(*slopes, *color),
+            )
+            for label, images, levels, sigma, color in (
+                ("number", whole, 2, number, {}),
+                ("masked, per feature", masked, 3, each, {}),
+                ("masked, color", masked, 2, number, {"sigma_color": np.array(2.0)}),
+            )
+        ),
+        *(
+            Case("filters.fireflies.clamp_fireflies", {"image": x, "factor": 4.0, "radius": r}, label)
+            for label, x, r in (
+                ("colors", sparse, 2),
+                ("one channel", _spoiled(sparse[..., :1], (2, 2), value=np.inf), 1),
+            )
+        ),
+    ]
+
+
+def _denoising() -> list[Case]:
+    radiance, albedo = _uniform(0.0, 4.0, 3, 4, 3), _uniform(0.1, 1.0, 3, 4, 3)
+    albedo[0, 0, 1] = albedo[0, 1, :2] = albedo[0, 2] = 1e-4
+    albedo[0, 3, 2] = np.nan
+    image, filtered, share = _normal(5, 6, 3), _normal(5, 6, 3), _uniform(0.0, 0.8, 5, 6)
+    judged = {"filtered": filtered, "share": share, "weight": _uniform(0.1, 1.0, 5, 6, 3)}
+    # Wider than the windows that shares are means over.
+    signs = np.sign(_normal(2, 22))
+    return [
+        Case("filters.albedo.demodulate", {"radiance": radiance, "albedo": albedo}, gradients=("radiance",)),
+        Case("filters.albedo.remodulate", {"light": radiance, "albedo": albedo}, gradients=("light",)),
+        *(
+            Case(f"filters.albedo.{kernel}", {name: radiance[1:2], "albedo": albedo[1:2], "floor": 0.5}, "floor")
+            for kernel, name in (("demodulate", "radiance"), ("remodulate", "light"))
+        ),
+        Case("filters.cross_validation.own_share", {"probe": signs, "filtered_probe": 0.5 * signs + _normal(2, 22)}),
+        Case(
+            "filters.cross_validation.leave_one_out_error",
+            {"image": image, **judged},
+            gradients=("image", "filtered", "share", "weight"),
+        ),
+        Case(
+            "filters.cross_validation.leave_one_out_error",
+            {"image": _spoiled(image, (0, 0), (4, 5)), **judged},
+            "masked",
+            gradients=("image", "filtered"),
+        ),
+    ]
+
+
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
         _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility,
         _pose_model, _skeleton, _skinning, _camera, _metrics, _scene, _texture, _quads, _warps, _brdf,
-        _whole_scene, _deferred_shading, _late, _box_filters, _guided_filter,
+        _whole_scene, _deferred_shading, _late, _box_filters, _guided_filter, _pair_filters, _denoising,
     )
     for case in room()
 )  # fmt: skip

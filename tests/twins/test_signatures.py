@@ -20,10 +20,16 @@ PAIRED = (
     "vecmath", "camera", "metrics", "scene", "brdf", "harmonics.", "animation.skeleton", "animation.skinning",
     "deferred.samples", "deferred.texture", "deferred.quads", "deferred.warps", "deferred.gbuffer", "deferred.shade",
     "deferred.late", "deferred.metrics", "deferred.sampling", "deferred.clusters", "deferred.fxaa", "deferred.mlaa",
-    "deferred.sraa", "deferred.highlights", "filters.sat", "filters.guided", "filters.valid",
+    "deferred.sraa", "deferred.highlights", "filters.",
 )  # fmt: skip
 UNPAIRED_MODULES = {
     "harmonics.pipeline": "the order of the stages, no arithmetic",
+    "filters.aovs": "a record of the host: images by name, and a check of shapes",
+    "filters.denoiser": "runs on the host: the order of the kernels and the choice of settings",
+    "filters.guides": "runs on the host: reads the extent of the scene off the images",
+    "filters.bands": "pieces of an image; held against the whole in tests/filters",
+    "filters.windows": "how jaxrender sums; torchref sums each window",
+    "filters.precision": "torchref has its one rule",
     "filters.guided_rows": "what a CPU runs for guided_filter; held against filter_planes in tests/filters",
 }
 
@@ -66,6 +72,14 @@ EXCEPTIONS = {
     "filters.guided.center_of": "the same",
     "filters.guided.filter_centered": "jaxrender's own way: pieces of an image",
     "filters.valid.check_images": "a check of shapes",
+    "filters.bilateral.half_window": "jaxrender's own way: each pair of pixels once, planes as rows",
+    "filters.bilateral.working_dtype": "the same",
+    "filters.bilateral.sigma_values": "the same",
+    "filters.bilateral.finite": "the same",
+    "filters.bilateral.to_planes": "the same",
+    "filters.bilateral.from_planes": "the same",
+    "filters.bilateral.weighted_mean": "the same",
+    "filters.bilateral.pair_sums": "the same",
 }
 
 # Kernels with a partner that are compared in a test of their own.

@@ -1,0 +1,226 @@
+"""jaxrender.filters.denoiser: sums and parts, what stays, counts, how much cleaner, the rule, cross-validation."""
+
+import dataclasses
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxrender.filters.aovs import Aovs
+from jaxrender.filters.denoiser import AUTO_EPS, DenoiseSettings, apply_filter, denoise, rule
+from jaxrender.filters.guides import make_guides
+
+HEIGHT, WIDTH = 32, 48
+PLAIN = DenoiseSettings(radius=4, eps=1.0, firefly_factor=None)
+METHODS = ("guided", "bilateral", "atrous")
+
+
+@pytest.fixture(autouse=True)
+def _nan_is_a_value():
+    """What is left out of a filter is NaN."""
+    with jax.debug_nans(False):
+        yield
+
+
+@pytest.fixture
+def walls(rng):
+    """Two walls that meet, each lit from its own side, and their texture; with the light that is true."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    left = (x < 20)[..., None]
+    light = np.where(left, 0.4 + 0.01 * x[..., None], 1.2 - 0.01 * y[..., None]) * np.array([1.0, 0.9, 0.7])
+    images = {
+        "albedo": rng.uniform(0.2, 0.9, (HEIGHT, WIDTH, 3)),
+        "normal": np.where(left, [1.0, 0.0, 0.0], [0.0, 0.6, 0.8]),
+        "depth": 5.0 + 0.02 * np.abs(x - 20)[..., None],
+    }
+    return {name: image.astype(np.float32) for name, image in images.items()}, light.astype(np.float32)
+
+
+def noise(rng, samples=4.0):
+    """Mean 1."""
+    return rng.gamma(samples, 1.0 / samples, (HEIGHT, WIDTH, 3)).astype(np.float32)
+
+
+# --- Sums
+
+
+@pytest.mark.parametrize("emission", [False, True])
+def test_parts_add_up_to_the_picture(rng, walls, emission):
+    images, light = walls
+    parts = {name: images["albedo"] * light * noise(rng) for name in ("direct", "indirect")}
+    parts |= {"emission": (rng.uniform(size=(HEIGHT, WIDTH, 3)) < 0.01).astype(np.float32)} if emission else {}
+    clean = denoise(Aovs(sum(parts.values()), **parts, **images), PLAIN)
+    assert clean.layers.keys() == parts.keys()
+    np.testing.assert_allclose(sum(clean.layers.values()), clean.image, rtol=1e-6)
+    for name in parts.keys() - {"indirect"}:
+        np.testing.assert_array_equal(clean.layers[name], parts[name])
+    # The same indirect light as a picture of its own, without a word about parts.
+    alone = denoise(Aovs(parts["indirect"], **images), PLAIN)
+    assert alone.layers == {}
+    np.testing.assert_array_equal(alone.image, clean.layers["indirect"])
+    assert np.abs(clean.layers["indirect"] - parts["indirect"]).max() > 0.1
+
+
+def test_a_part_that_is_not_finite_is_black(rng, walls):
+    images, light = walls
+    parts = {name: images["albedo"] * light * noise(rng) for name in ("direct", "indirect")}
+    parts["direct"][3, 4, 1] = parts["indirect"][3, 5] = np.nan
+    clean = denoise(Aovs(parts["direct"] + parts["indirect"], **parts, **images), PLAIN)
+    assert np.isfinite(clean.image).all() and (clean.layers["direct"][3, 4] == 0.0).all()
+    assert clean.counts["nan"] == clean.counts["filled"] == 2
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_it_is_linear(rng, walls, method):
+    images, light = walls
+    settings = dataclasses.replace(PLAIN, method=method)
+    first, second = (images["albedo"] * light * rng.uniform(0.8, 1.2, (HEIGHT, WIDTH, 1)) for _ in range(2))
+    clean = [
+        denoise(Aovs(x.astype(np.float32), **images), settings) for x in (first, second, 5 * first, first + second)
+    ]
+    assert [each.counts["raised"] for each in clean] == [0] * 4
+    one, two, five, both = (each.image for each in clean)
+    np.testing.assert_allclose(five, 5.0 * one, rtol=1e-5)
+    np.testing.assert_allclose(both, one + two, rtol=1e-5)
+
+
+# --- What stays, and counts
+
+
+def test_sky_passes_and_pixels_are_counted(rng, walls):
+    images, light = walls
+    images = {name: image.copy() for name, image in images.items()}
+    color = images["albedo"] * light
+    sky = np.zeros((HEIGHT, WIDTH), bool)
+    sky[:5, 30:] = True
+    for image in images.values():
+        image[sky] = 0.0
+    color[sky] = rng.uniform(size=(sky.sum(), 3))
+    color[0, 47, 0] = np.nan  # in the sky, where nothing fills it
+    color[10, 10], color[20, 30, 2] = np.nan, np.inf
+    color[12, 40] = -0.1
+    color[25, 8] *= 100.0
+    clean = denoise(Aovs(color, **images), DenoiseSettings(radius=4, eps=1.0))
+    # Nothing comes out below 0: the one pixel below it is in the middle of bright ones.
+    assert clean.counts == {"nan": 3, "filled": 2, "negative": 1, "clamped": 1, "raised": 0}
+    color[0, 47] = 0.0
+    np.testing.assert_array_equal(clean.image[sky], color[sky])
+    assert np.isfinite(clean.image).all()
+    truth = images["albedo"] * light
+    for y, x in ((10, 10), (20, 30)):
+        np.testing.assert_allclose(clean.image[y, x], truth[y, x], rtol=0.1)
+    # 16 times its neighbours, as it is clamped to, in windows of 81 pixels that cover it.
+    assert (clean.image[25, 8] < 1.5 * truth[25, 8]).all()
+
+
+def test_what_the_filter_puts_below_0_is_raised(walls):
+    """A fit of a line to light that falls to 0 on a slope of depth goes on below it."""
+    images, _ = walls
+    x = np.linspace(0.0, 1.0, WIDTH, dtype=np.float32)
+    depth = np.broadcast_to(1.0 + x[:, None], (HEIGHT, WIDTH, 1))
+    color = np.broadcast_to(np.maximum(0.3 - x, 0.0)[:, None], (HEIGHT, WIDTH, 3)).astype(np.float32)
+    settings = dataclasses.replace(PLAIN, eps=0.01)
+    aovs = Aovs(color, normal=images["normal"] * 0.0 + np.float32([0.0, 0.0, 1.0]), depth=depth)
+    clean = denoise(aovs, settings)
+    filtered = apply_filter(jnp.asarray(color), make_guides(aovs), settings)
+    below = np.asarray(filtered < 0.0).any(-1)
+    assert 0 < below.sum() == clean.counts["raised"] < HEIGHT * WIDTH
+    np.testing.assert_allclose(clean.image, np.maximum(filtered, 0.0), atol=1e-6)
+
+
+def test_gray_stays_gray(rng, walls):
+    """A gray picture comes as three channels alike."""
+    images, light = walls
+    gray = np.repeat((light * noise(rng))[..., :1], 3, axis=-1)
+    clean = denoise(Aovs(gray, normal=images["normal"]), PLAIN).image
+    np.testing.assert_array_equal(clean, np.repeat(clean[..., :1], 3, axis=-1))
+    with pytest.raises(ValueError, match=r"color: expected shape .*, 3\)"):
+        denoise(Aovs(gray[..., :1], normal=images["normal"]), PLAIN)
+
+
+# --- How much cleaner
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_noise_goes_and_edges_stay(rng, walls, method):
+    images, light = walls
+    truth = images["albedo"] * light
+    noisy = truth * noise(rng)
+    settings = DenoiseSettings(method=method, samples_per_pixel=4.0)
+    clean = denoise(Aovs(noisy, **images), settings)
+    assert clean.chosen["how"] == "rule" and clean.chosen["radius"] == 4
+    before, after = (np.mean((image - truth) ** 2) for image in (noisy, clean.image))
+    assert after < 0.15 * before
+    # Without the albedo in the way; the texture is lost if it is not divided out.
+    kept = denoise(Aovs(noisy, **images), dataclasses.replace(settings, demodulate=False))
+    assert np.mean((kept.image - truth) ** 2) > 2.0 * after
+    edge = np.s_[:, 18:22]
+    assert np.abs(clean.image - truth)[edge].mean() < 2.0 * np.abs(clean.image - truth).mean()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_rule_falls_with_samples_and_has_bounds(method):
+    radii = [rule(method, height=384, width=512, samples_per_pixel=s) for s in (1e-9, 1, 2, 4, 16, 64, 1e9)]
+    assert radii == sorted(radii, reverse=True) and len(set(radii)) > 4
+    assert radii[0] <= 384 // 8 and radii[-1] == 2
+    assert rule(method, height=8, width=512, samples_per_pixel=1.0) == 2
+    assert rule(method, height=48, width=64, samples_per_pixel=1e-3) == 6
+
+
+def test_auto_goes_by_the_noise(rng, walls, monkeypatch):
+    """It sees no more than the picture, and comes close to what the truth would choose."""
+    monkeypatch.setattr(sys.modules[denoise.__module__], "AUTO_RADII", (0.5, 1.0, 2.0))  # each is a program
+    images, _ = walls
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    truth = 0.5 + 0.15 * np.sin(x / 4.0)[..., None] * np.cos(y / 5.0)[..., None] * np.ones(3)
+    guides = {name: images[name] for name in ("normal", "depth")}
+    chosen = {}
+    for sigma in (0.01, 0.3):
+        noisy = (truth + sigma * rng.normal(size=truth.shape)).astype(np.float32)
+        asked = DenoiseSettings(auto=True, firefly_factor=None, samples_per_pixel=4.0)
+        clean = denoise(Aovs(noisy, **guides), asked)
+        assert clean.chosen["how"] == "cross-validation"
+        chosen[sigma] = clean.chosen["radius"]
+        # A fourth channel, as the choice had it: the same programs.
+        light = jnp.asarray(np.concatenate([noisy, noisy[..., :1]], axis=-1))
+        errors = [
+            np.mean((np.asarray(apply_filter(light, make_guides(Aovs(noisy, **guides)), each))[..., :3] - truth) ** 2)
+            for radius in (2, 4, 8)
+            for each in (dataclasses.replace(asked, radius=radius, eps=eps) for eps in AUTO_EPS)
+        ]
+        assert max(errors) > 1.3 * min(errors)
+        assert np.mean((clean.image - truth) ** 2) < 1.1 * min(errors), (sigma, clean.chosen)
+    assert chosen[0.01] < chosen[0.3]
+
+
+def test_auto_leaves_what_is_given(rng, walls):
+    images, light = walls
+    aovs = Aovs(light * noise(rng), normal=images["normal"])
+    given = denoise(aovs, dataclasses.replace(PLAIN, auto=True, eps=None)).chosen
+    assert given["radius"] == 4 and given["eps"] in AUTO_EPS
+    given = denoise(aovs, PLAIN).chosen
+    assert (given["how"], given["radius"], given["eps"], given["samples_per_pixel"]) == ("given", 4, 1.0, "unknown")
+
+
+# --- Bad input
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("method", "mean"), ("radius", 0), ("eps", 0.0), ("eps", np.nan), ("samples_per_pixel", -1.0),
+        ("samples_per_pixel", np.inf), ("firefly_factor", 0.5), ("firefly_factor", np.nan),
+    ],
+)  # fmt: skip
+def test_settings_out_of_range_are_named(walls, field, value):
+    images, light = walls
+    with pytest.raises(ValueError, match=f"^{field}: "):
+        denoise(Aovs(light, **images), DenoiseSettings(**{field: value}))
+
+
+def test_nothing_to_go_by(walls):
+    images, light = walls
+    with pytest.raises(ValueError, match="aovs: expected normal, depth or position, got none of them"):
+        denoise(Aovs(light, albedo=images["albedo"]), PLAIN)
