@@ -20,7 +20,7 @@ rays is below 0.5. `flip` and `ssim` are of the first seed. `flicker_255`: varia
 The rows of the scene `all` sum up: `cells_won` of `cells` (scenes by samples) in which mse_255 is below those of both
 `bilateral_best` and `atrous_best`; `cells_won_relative`, the same of relative_mse; `mse_ratio`, the geometric mean of
 mse_255 over that of the better of the two; `contact_ratio`, that of contact_mse_255 over that of `normal_depth`.
-Pictures are in `out/filters`.
+Quick runs do not search. Pictures are in `out/filters`.
 """
 
 import functools
@@ -394,7 +394,7 @@ def _cell_rows(cell: Cell, ways: Mapping[str, Callable[[Cell, int], Result]], si
         yield Measurement("quality", name, metrics, {**common, "settings": _told(settings)})
     if first.spp in sizes.pictures:
         strip = {"reference": cell.reference, **dict(panels[name] for name in PANELS if name in panels)}
-        draw_strip(cell, strip, OUT / f"{first.scene}_{first.spp}.png")
+        draw_strip(cell, strip, OUT / f"{first.scene}_{width}x{height}_{first.spp}.png")
 
 
 def _load(scene: str, spp: int, sizes: Sizes) -> list[Renders]:

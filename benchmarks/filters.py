@@ -15,6 +15,7 @@ float64 sums over the upper left corner of the picture, `max_error_inside` that 
 filters are one. `peak_bytes` is the growth of the process in a call after the first.
 """
 
+import dataclasses
 import functools
 import importlib
 import types
@@ -61,8 +62,9 @@ class Sizes:
     """How much is measured; heights before widths."""
 
     table: tuple[tuple[int, int], ...] = ((768, 1024), (2160, 3840))
-    #: Larger pictures get radius 16 only, and of kornia the separable filter only: the others take minutes a call.
+    #: Larger pictures get fewer runs, the smallest bilateral radius only, and no peers that would take minutes a call.
     small_pixels: int = 2_000_000
+    runs_of_large: int = 3
     bilateral_radii: tuple[int, ...] = (16, 24, 32)
     levels: tuple[int, ...] = (4, 5, 6)
     guide_channels: tuple[int, ...] = (1, 3, 4)
@@ -138,23 +140,24 @@ def _table2(sizes: Sizes, seed: int) -> Iterator[Measurement]:
     for height, width in sizes.table:
         picture = draw_picture(height, width, seed)
         small = height * width <= sizes.small_pixels
+        runs = sizes if small else dataclasses.replace(sizes, min_runs=min(sizes.min_runs, sizes.runs_of_large))
         size: Params = {"height": height, "width": width, "seed": seed}
         for radius in sizes.bilateral_radii if small else sizes.bilateral_radii[:1]:
-            yield from _bilateral(picture, radius, size, sizes)
+            yield from _bilateral(picture, radius, size, runs, with_peer=small)
         for levels in sizes.levels:
-            yield from _atrous(picture, levels, size, sizes)
+            yield from _atrous(picture, levels, size, runs)
         for channels in sizes.guide_channels:
-            yield from _guided(picture, channels, size, sizes, plain_kornia=small)
-        yield from _oidn(picture, size, sizes)
+            yield from _guided(picture, channels, size, runs, plain_kornia=small)
+        yield from _oidn(picture, size, runs)
 
 
-def _bilateral(picture: Picture, radius: int, size: Params, sizes: Sizes) -> Iterator[Measurement]:
+def _bilateral(picture: Picture, radius: int, size: Params, sizes: Sizes, *, with_peer: bool) -> Iterator[Measurement]:
     ours = partial(cross_bilateral_filter, radius=radius, sigma_spatial=radius / 2, sigma_features=SIGMA_FEATURES)
     images = picture.noisy, picture.guide
     variants: dict[str, Call] = {"jaxrender": _jitted(ours, images)}
     params: Params = {**size, "filter": "bilateral", "radius": radius, "features": 4, "sigma_features": SIGMA_FEATURES}
     differs: dict[str, Params] = {}
-    if cv2 := peer("opencv"):
+    if with_peer and (cv2 := peer("opencv")):
         joint = np.ascontiguousarray(picture.guide[..., :3])
         variants["opencv"] = partial(
             cv2.ximgproc.jointBilateralFilter, joint, picture.noisy, 2 * radius + 1, SIGMA_FEATURES, radius / 2

@@ -8,7 +8,6 @@ noisy picture and its clean partner, as log eps, by gradient descent, and judged
 """
 
 import sys
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -40,7 +39,7 @@ def denoise(log_eps: jax.Array, guide: jax.Array, noisy: jax.Array) -> jax.Array
     return guided_filter(guide, noisy, radius=RADIUS, eps=jnp.exp(log_eps))
 
 
-def error(log_eps, guide, noisy, light) -> jax.Array:
+def error(log_eps: jax.Array, guide: jax.Array, noisy: jax.Array, light: jax.Array) -> jax.Array:
     """Mean squared."""
     return jnp.mean((denoise(log_eps, guide, noisy) - light) ** 2)
 
@@ -61,12 +60,11 @@ def main(folder: Path) -> dict[str, float]:
     start = jnp.full(3, jnp.log(0.01))
     found = learn(start, guide, rendered(light, seed=0), light)
     fresh = rendered(light, seed=1)
-    judge = jax.jit(partial(error, guide=guide, noisy=fresh, light=light))
-    pictures = [fresh, *(jax.jit(denoise)(e, guide, fresh) for e in (start, found)), light]
-    row = np.concatenate([np.asarray(p) for p in pictures], axis=1)
-    write_png(folder / "guided_inverse.png", np.repeat(np.clip(row, 0.0, 1.0), 3, axis=2))
-    eps = dict(zip(("eps of surface", "eps of depth", "eps of pattern"), jnp.exp(found).tolist(), strict=True))
-    result = {"error before": float(judge(start)), "error after": float(judge(found)), **eps}
+    before, after = (np.asarray(jax.jit(denoise)(log_eps, guide, fresh)) for log_eps in (start, found))
+    row = np.clip(np.concatenate([fresh, before, after, light], axis=1), 0.0, 1.0)
+    write_png(folder / "guided_inverse.png", np.repeat(row, 3, axis=2))
+    result = {f"error {name}": float(np.mean((x - light) ** 2)) for name, x in (("before", before), ("after", after))}
+    result |= zip(("eps of surface", "eps of depth", "eps of pattern"), jnp.exp(found).tolist(), strict=True)
     for name, value in result.items():
         print(f"{name:16s} {value:.2e}")
     return result

@@ -137,11 +137,14 @@ def denoise(aovs: Aovs, settings: DenoiseSettings) -> Denoised:
     return Denoised(image, layers, {name: int(np.sum(mask)) for name, mask in counts.items()}, _told(chosen, settings))
 
 
-def rule(method: Method, *, height: int, width: int, samples_per_pixel: float) -> int:
+def rule(method: Method, *, height: int, width: int, samples_per_pixel: float, lit_share: float = 1.0) -> int:
     """The radius for so many samples a pixel, in pixels whatever the picture's size: less noise asks for less blur.
 
     Found on indirect light of four scenes at 512 x 384; at 1024 x 768 the same number of pixels is best again, as noise
     and the features that guides leave to blur are both counted in pixels. At most an eighth of the shorter side.
+
+    Args:
+      lit_share: of the pixels, those with any light. Where few paths find light, each tells less.
     """
     if method == "bilateral":
         radius = 24.0 * samples_per_pixel**-0.4
@@ -149,6 +152,7 @@ def rule(method: Method, *, height: int, width: int, samples_per_pixel: float) -
         radius = 30.0 * samples_per_pixel**-0.33
     else:
         radius = 16.0 * samples_per_pixel ** (-1.0 / 3.0)
+    radius *= max(lit_share, 0.01) ** -0.25
     return int(np.clip(round(radius), 2, max(2, min(height, width) // 8)))
 
 
@@ -175,7 +179,9 @@ def choose(
     """
     height, width = light.shape[:2]
     samples = settings.samples_per_pixel or USUAL_SAMPLES
-    by_rule = rule(settings.method, height=height, width=width, samples_per_pixel=samples)
+    finite = np.asarray(light)[np.isfinite(np.asarray(light)).all(axis=-1)]
+    lit = float(finite.any(axis=-1).mean()) if finite.size else 1.0
+    by_rule = rule(settings.method, height=height, width=width, samples_per_pixel=samples, lit_share=lit)
     start = replace(settings, radius=settings.radius or by_rule, eps=settings.eps or 1.0)
     if not settings.auto:
         return start

@@ -87,7 +87,7 @@ def test_filters_denoise_and_ambient_occlusion_keeps_the_stripe(made):
 
 def test_draws_a_strip(made):
     _, folder = made
-    with PIL.Image.open(folder / "out/filters/cornell_4.png") as picture:
+    with PIL.Image.open(folder / f"out/filters/cornell_{WIDTH}x{HEIGHT}_4.png") as picture:
         assert picture.width > 3 * 2 * (3 * WIDTH // 8)
 
 

@@ -108,7 +108,7 @@ def test_missing_peers_are_named_once_and_have_no_rows(without_peers, capsys, mo
     tiny = suite.Sizes(min_runs=1, min_seconds=0.0)
     picture = suite.draw_picture(20, 24, 0)
     for radius in (1, 2):
-        rows = list(suite._bilateral(picture, radius, {}, tiny))
+        rows = list(suite._bilateral(picture, radius, {}, tiny, with_peer=True))
         assert [row.variant for row in rows] == ["jaxrender"]
     assert list(suite._oidn(picture, {}, tiny)) == []
     said = capsys.readouterr().err.replace("\n", " ")

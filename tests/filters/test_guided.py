@@ -326,16 +326,6 @@ def bilinear(x, step: int) -> np.ndarray:
     return np.stack([cv2.resize(x[..., k], size, interpolation=cv2.INTER_LINEAR) for k in range(x.shape[2])], axis=-1)
 
 
-def test_a_subsampled_filter_is_close_to_the_whole_one():
-    y, x = np.mgrid[:HEIGHT, :WIDTH] / 16.0
-    guide = np.stack([y, x, np.sin(2.0 * x + y)], axis=-1)
-    image = np.stack([x * y, np.cos(3.0 * x)], axis=-1)
-    whole = run(guide, image, eps=PER_CHANNEL)
-    np.testing.assert_allclose(run(guide, image, eps=PER_CHANNEL, subsample=2), whole, rtol=0, atol=0.1)
-    masked = run(*mask(guide, image), eps=PER_CHANNEL, subsample=2)
-    np.testing.assert_allclose(masked[:8, :8], whole[:8, :8], rtol=0, atol=0.1)
-
-
 # --- Masked pixels, batches, bad input
 
 

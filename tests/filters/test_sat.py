@@ -127,6 +127,14 @@ def test_an_offset_costs_no_precision(rng):
     np.testing.assert_allclose(after, before, rtol=1e-5, atol=1e-6 * 255.0**2)
 
 
+def test_a_variance_is_never_negative(rng):
+    """Flat blocks far from the mean of the image, where the difference of moments is rounding alone."""
+    image = np.kron(rng.uniform(size=(6, 6, 1)), np.ones((9, 9, 1))).astype(np.float32)
+    variance = np.asarray(quick_moments(image, 3)[1])
+    assert variance.min() >= 0.0
+    np.testing.assert_allclose(variance[4::9, 4::9], 0.0, atol=1e-6)
+
+
 def test_scaling_constants_and_channels(rng):
     image = rng.uniform(size=(20, 24, 3)).astype(np.float32)
     mean, variance = quick_moments(image, 3)
