@@ -4,8 +4,8 @@ Images are arrays of NumPy or whatever can be cut like them (`numpy.memmap`, a z
 comes. A filter looks only so far, its halo: bands overlap by it and are cropped afterwards.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ def in_bands(
     *,
     rows: int,
     halo: int | tuple[int, int],
+    compiled: bool = False,
 ) -> Iterator[Float[np.ndarray, "b w _"]]:
     """The bands of function(*images), each `rows` high but for the last, from the top.
 
@@ -35,6 +36,7 @@ def in_bands(
         `guided_filter_in_bands`.
       halo: rows that a pixel depends on above and below it: one number, or (above, below).
       images: of one height.
+      compiled: whether `function` is compiled for all bands; else the first band runs alone, before the others.
     Raises:
       ValueError: if heights differ, rows < 1 or halo < 0.
     """
@@ -51,7 +53,7 @@ def in_bands(
         result = function(*(jnp.asarray(np.asarray(image[first:last])) for image in images))
         return np.asarray(result[start - first : min(height, start + rows) - first])
 
-    return on_all_cores(band, range(0, height, rows))
+    return on_all_cores(band, range(0, height, rows), compiled=compiled)
 
 
 def guided_filter_in_bands(
@@ -81,12 +83,25 @@ def guided_filter_in_bands(
     dtype = working(jnp.asarray(np.asarray(image[:1])).dtype)
     centers = [jnp.asarray(center, dtype) for center in _centers(guide, image, rows)]
     ridge = jnp.asarray(eps, dtype)
-    function = jax.jit(partial(_band, radius=radius))
-    return in_bands(lambda a, b: function(a, b, *centers, ridge), (guide, image), rows=rows, halo=(2 * step, step))
+    rest = tuple(jax.ShapeDtypeStruct(x.shape, dtype) for x in (*centers, ridge))
+    programs = {}
+    height, (above, below) = image.shape[0], (2 * step, step)
+    for start in range(0, height, rows):
+        size = min(height, start + rows + below) - max(0, start - above)
+        shapes = [jax.ShapeDtypeStruct((size, *x.shape[1:]), jnp.asarray(x[:1]).dtype) for x in (guide, image)]
+        programs[size] = _program(*shapes, *rest, radius=radius)
+    function = lambda a, b: programs[len(a)](a, b, *centers, ridge)  # noqa: E731
+    return in_bands(function, (guide, image), rows=rows, halo=(above, below), compiled=True)
 
 
-def _band(guide, image, guide_center, image_center, eps, *, radius: int):
-    return filter_centered(guide, image, guide_center, image_center, radius=radius, eps=eps)
+@functools.cache
+def _program(guide, image, guide_center, image_center, eps, *, radius: int):
+    """The filter for bands of one size, compiled once; programs made by several threads at once can crash."""
+
+    def band(guide, image, guide_center, image_center, eps):
+        return filter_centered(guide, image, guide_center, image_center, radius=radius, eps=eps)
+
+    return jax.jit(band).lower(guide, image, guide_center, image_center, eps).compile()
 
 
 def _centers(guide, image, rows: int) -> list[Float[np.ndarray, " _"]]:

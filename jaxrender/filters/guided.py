@@ -44,6 +44,10 @@ def guided_filter(
     window without any valid pixel predicts the mean of the image (to 8 bits). Time does not depend on the radius. Half
     precision is computed in float32; the result has the image's dtype.
 
+    In float32, eps should not be far below 1e-5 times the squared range of the guide. A CPU keeps running sums down the
+    columns, so the rounding of a spike stays below it for some dozen rows: of one 10⁶ times as bright as the rest a few
+    hundredths of the rest. Clamp spikes first (`clamp_fireflies`).
+
     Differentiable in guide, image and eps, by a rule of its own that keeps only the arguments and makes about
     5 (g + 1) (g + c + 1) planes on the way back.
 

@@ -141,6 +141,6 @@ def _row(planes: Array, y) -> Array:
     return lax.dynamic_index_in_dim(planes, y, axis=-2, keepdims=False)
 
 
-def _put(place: Float[Array, "n+1 _ w"], value: Float[Array, "n _ w"], t) -> Float[Array, "n+1 _ w"]:
+def _put(place: Float[Array, "m k w"], value: Float[Array, "n k w"], t) -> Float[Array, "m k w"]:
     """`value` in all but the last entry of `place`: at 0, which the compiler cannot know, so it has to store it."""
     return lax.dynamic_update_slice(place, value, (jnp.minimum(t, 0), 0, 0))

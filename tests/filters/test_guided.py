@@ -83,8 +83,8 @@ def test_it_is_that_in_float32():
         ((1, 9), 1, 1, 3),
         ((9, 1), 1, 2, 0),
         ((5, 4), 4, 1, 50),
-        ((40, 7), 3, 2, 2),  # running sums start afresh after 32 rows
-        ((70, 5), 1, 1, 17),  # and after 64
+        ((100, 7), 3, 2, 2),  # running sums start afresh every 32 rows
+        ((140, 5), 1, 1, 17),  # and every 64
     ],
 )
 def test_both_ways_through_the_image_are_one(size, g, c, radius, rng, x64):
