@@ -47,11 +47,13 @@ def in_bands(
     if len(heights) != 1:
         raise ValueError(f"images: expected one height, got {sorted(heights)}")
     (height,) = heights
+    wide = jnp.result_type(float) == jnp.float64  # a setting of this thread
 
     def band(start: int) -> np.ndarray:
         first, last = max(0, start - above), min(height, start + rows + below)
-        result = function(*(jnp.asarray(np.asarray(image[first:last])) for image in images))
-        return np.asarray(result[start - first : min(height, start + rows) - first])
+        with jax.enable_x64(wide):
+            result = function(*(jnp.asarray(np.asarray(image[first:last])) for image in images))
+        return np.asarray(result)[start - first : min(height, start + rows) - first]
 
     return on_all_cores(band, range(0, height, rows), compiled=compiled)
 
