@@ -99,6 +99,7 @@ class Denoised:
     chosen: dict[str, float | int | str] = field(default_factory=dict)
 
 
+@jax.debug_nans(False)  # here NaN marks pixels without a value
 def denoise(aovs: Aovs, settings: DenoiseSettings) -> Denoised:
     """Filters the indirect light if it is separate, else the picture without lamps; what shows no surface stays too.
 

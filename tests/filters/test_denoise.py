@@ -17,9 +17,9 @@ PLAIN = DenoiseSettings(radius=4, eps=1.0, firefly_factor=None)
 METHODS = ("guided", "bilateral", "atrous")
 
 
-@pytest.fixture(autouse=True)
-def _nan_is_a_value():
-    """What is left out of a filter is NaN."""
+@pytest.fixture
+def nan_is_a_value():
+    """`apply_filter` leaves out what is NaN; `denoise` itself runs whatever the caller set."""
     with jax.debug_nans(False):
         yield
 
@@ -169,6 +169,7 @@ def test_the_rule_falls_with_samples_and_has_bounds(method):
     assert rule(method, height=48, width=64, samples_per_pixel=1e-3) == 6
 
 
+@pytest.mark.usefixtures("nan_is_a_value")
 def test_auto_goes_by_the_noise(rng, walls, monkeypatch):
     """It sees no more than the picture, and comes close to what the truth would choose."""
     monkeypatch.setattr(sys.modules[denoise.__module__], "AUTO_RADII", (0.5, 1.0, 2.0))  # each is a program
