@@ -40,6 +40,25 @@ def check_at_least(name: str, value: int | float, smallest: int | float) -> None
         raise ValueError(f"{name}: expected a value >= {smallest}, got {value}")
 
 
+def check_whole(name: str, value: object, smallest: int) -> None:
+    """Raises ValueError unless `value` is an integer >= `smallest`."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool):
+        raise ValueError(f"{name}: expected a whole number >= {smallest}, got {value}")
+    check_at_least(name, int(value), smallest)
+
+
+def check_above_0(name: str, value: object) -> None:
+    """Raises ValueError unless `value` is finite and above 0, if it is a number or an array of NumPy's.
+
+    An array of JAX may be one of a program that is being traced, or of one that is still running.
+    """
+    if not isinstance(value, int | float | list | tuple | np.ndarray | np.generic):
+        return
+    wrong = np.asarray(value)[~((np.asarray(value) > 0.0) & np.isfinite(value))]
+    if wrong.size:
+        raise ValueError(f"{name}: expected finite numbers above 0, got {wrong.flat[0]}")
+
+
 def check_one_of(name: str, value: object, allowed: Sequence[object]) -> None:
     """Raises ValueError unless `value` is one of `allowed`."""
     if value not in allowed:

@@ -34,6 +34,23 @@ def test_at_least():
             checks.check_at_least("radius", value, 1)
 
 
+def test_whole():
+    checks.check_whole("radius", np.int64(3), 0)
+    for value in (2.5, 2.0, True, "2"):
+        with pytest.raises(ValueError, match=f"radius: expected a whole number >= 0, got {value}"):
+            checks.check_whole("radius", value, 0)
+    with pytest.raises(ValueError, match="radius: expected a value >= 0, got -1"):
+        checks.check_whole("radius", -1, 0)
+
+
+def test_above_0():
+    for value in (1e-30, [0.1, 2], np.ones((2, 3)), jnp.zeros(3)):  # arrays of JAX are not looked at
+        checks.check_above_0("eps", value)
+    for value, wrong in ((0, "0"), (-1.0, "-1.0"), ([1.0, 0.0], "0.0"), (np.array([2.0, np.inf]), "inf")):
+        with pytest.raises(ValueError, match=f"eps: expected finite numbers above 0, got {wrong}"):
+            checks.check_above_0("eps", value)
+
+
 def test_one_of():
     checks.check_one_of("mode", "flat", ("flat", "linear"))
     with pytest.raises(ValueError, match="mode: expected one of flat, linear, got cubic"):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxrender.checks import check_at_least
+from jaxrender.checks import check_whole
 from jaxrender.filters.bilateral import (
     Likeness,
     finite,
@@ -63,7 +63,7 @@ def atrous_filter(
       HPG 2010 (its colour sigma, too, halves from level to level; its details are dropped).
     """
     check_images(image=image, features=features)
-    check_at_least("num_levels", num_levels, 1)
+    check_whole("num_levels", num_levels, 1)
     dtype = working_dtype(image, features)
     height, width, channels = image.shape
     offsets, log_taps, gap = _taps(height, width, num_levels)

@@ -77,6 +77,8 @@ def guided_filter_in_bands(
     """
     if guide.shape[:2] != image.shape[:2]:
         raise ValueError(f"guide and image: expected one height and width, got {guide.shape} and {image.shape}")
+    checks.check_whole("radius", radius, 0)
+    checks.check_above_0("eps", eps)
     step = restart_rows(min(radius, image.shape[0] - 1))
     if rows is None:
         rows = -(-image.shape[0] // num_cores())

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxrender.checks import check_at_least
+from jaxrender.checks import check_whole
 from jaxrender.filters.valid import check_images, valid_pixels
 
 #: A smaller total weight counts as none: near the smallest float32, sums have no digits left.
@@ -69,7 +69,7 @@ def cross_bilateral_filter(
       filter); Eisemann, Durand, "Flash Photography Enhancement via Intrinsic Relighting", SIGGRAPH 2004 (cross).
     """
     check_images(image=image, features=features)
-    check_at_least("radius", radius, 0)
+    check_whole("radius", radius, 0)
     dtype = working_dtype(image, features)
     nearness = 0.5 / sigma_values("sigma_spatial", sigma_spatial, (), dtype) ** 2
     scales = math.sqrt(0.5) / sigma_values("sigma_features", sigma_features, features.shape[2:], dtype)

@@ -59,13 +59,15 @@ def guided_filter(
         bilinearly: about s² times quicker, a little softer.
       edge_aware: eps as given by `edge_aware_eps`: more on flat parts of the guide, less at its edges.
     Raises:
-      ValueError: if guide and image differ in size, or radius, subsample or the shape of eps do not fit.
+      ValueError: if guide and image differ in size, radius, subsample or the shape of eps do not fit, or eps is a
+        number, or an array of NumPy's, not all of it above 0.
     References:
       He, Sun, Tang, "Guided Image Filtering", PAMI 35(6), 2013, eqs. 5, 6, 8 and 14-16 (with eps inside the sum).
       He, Sun, "Fast Guided Filter", arXiv:1505.00996, 2015. Bauszat, Eisemann, Magnor, "Guided Image Filtering for
       Interactive High-quality Global Illumination", EGSR 2011, sec. 4.
     """
     _check(guide, image, radius=radius, subsample=subsample)
+    checks.check_above_0("eps", eps)
     centers = center_of(guide, image)
     ridge = edge_aware_eps(guide, eps=eps) if edge_aware else eps
     return filter_centered(guide, image, *centers, radius=radius, eps=ridge, subsample=subsample)
@@ -123,6 +125,7 @@ def edge_aware_eps(guide: Float[Array, "h w g"], *, eps: float | Float[Array, ".
       Li, Zheng, Zhu, Yao, Wu, "Weighted Guided Image Filtering", IEEE TIP 24(1), 2015, eqs. 5 and 9; the sum over
       channels is ours.
     """
+    checks.check_above_0("eps", eps)
     guide = guide.astype(working(guide.dtype))
     valid = valid_pixels(guide)
     planes = planes_of(jnp.where(valid[..., None], guide, jnp.zeros_like(guide)))
@@ -277,5 +280,5 @@ def _eps_planes(eps, guide) -> Float[Array, "g #h #w"]:
 def _check(guide, image, *, radius: int, subsample: int) -> None:
     if guide.ndim != 3 or image.ndim != 3 or guide.shape[:2] != image.shape[:2]:
         raise ValueError(f"guide and image: expected (h, w, g) and (h, w, c), got {guide.shape} and {image.shape}")
-    checks.check_at_least("radius", radius, 0)
-    checks.check_at_least("subsample", subsample, 1)
+    checks.check_whole("radius", radius, 0)
+    checks.check_whole("subsample", subsample, 1)

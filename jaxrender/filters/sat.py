@@ -29,7 +29,7 @@ def summed_area_table(image: Float[Array, "h w c"]) -> Float[Array, "h+1 w+1 c"]
 
 def box_sum_from_table(table: Float[Array, "h w c"], *, radius: int) -> Float[Array, "h-1 w-1 c"]:
     """Sums over windows of (2 radius + 1)² pixels, cropped at the border, from the four corners in the table."""
-    checks.check_at_least("radius", radius, 0)
+    checks.check_whole("radius", radius, 0)
     height, width = table.shape[0] - 1, table.shape[1] - 1
     y, x = jnp.arange(height), jnp.arange(width)
     top, bottom = jnp.maximum(y - radius, 0), jnp.minimum(y + radius + 1, height)
@@ -50,7 +50,7 @@ def box_mean(image: Float[Array, "h w c"], *, radius: int) -> Float[Array, "h w 
     Raises:
       ValueError: if radius < 0.
     """
-    checks.check_at_least("radius", radius, 0)
+    checks.check_whole("radius", radius, 0)
     valid = valid_pixels(image)
     means, _ = _window_means(planes_of(jnp.where(valid[..., None], image, jnp.zeros_like(image))), valid, radius)
     return jnp.moveaxis(means, 0, -1).astype(image.dtype)
@@ -62,7 +62,7 @@ def box_variance(image: Float[Array, "h w c"], *, radius: int) -> Float[Array, "
     Taken of the image less its own mean, so that an offset costs no precision. In float32 the error is below 1e-6 of
     the square of the image's range. Differentiable where the variance is not 0 by rounding; the derivative there is 0.
     """
-    checks.check_at_least("radius", radius, 0)
+    checks.check_whole("radius", radius, 0)
     valid = valid_pixels(image)
     planes = planes_of(jnp.where(valid[..., None], image, jnp.zeros_like(image)))
     planes = jnp.where(valid[None], planes - mean_of(planes, valid)[:, None, None], jnp.zeros_like(planes))

@@ -290,6 +290,7 @@ def test_valid_pixels_are_finite_in_all_channels_of_all_images():
         ((0, 5, 3), (0, 5, 2), {}, r"image: shape: .*got \(0, 5, 3\)"),
         ((4, 5, 3), (5, 4, 2), {}, r"features: height and width: expected \(4, 5\), got \(5, 4\)"),
         ((4, 5, 3), (4, 5, 2), {"radius": -1}, "radius: expected a value >= 0, got -1"),
+        ((4, 5, 3), (4, 5, 2), {"radius": 2.5}, "radius: expected a whole number >= 0, got 2.5"),
         ((4, 5, 3), (4, 5, 2), {"sigma_spatial": 0.0}, r"sigma_spatial: expected a value > 0, got 0.0"),
         ((4, 5, 3), (4, 5, 2), {"sigma_features": math.nan}, "sigma_features: expected a value > 0, got nan"),
         ((4, 5, 3), (4, 5, 2), {"sigma_features": jnp.ones(3)}, r"sigma_features: .*shape \(2,\), got shape \(3,\)"),

@@ -393,6 +393,11 @@ def test_a_pixel_depends_on_its_surroundings_alone():
         ((4, 5, 3), (4, 5, 1), {"eps": np.ones((5, 4, 1))}, ValueError, "eps: expected"),
         ((4, 5, 3), (4, 5, 1), {"eps": np.ones(2), "edge_aware": True}, ValueError, "eps: expected"),
         ((0, 5, 3), (0, 5, 1), {}, ValueError, "not empty"),
+        ((4, 5, 3), (4, 5, 1), {"eps": 0.0}, ValueError, "eps: expected finite numbers above 0, got 0.0"),
+        ((4, 5, 3), (4, 5, 1), {"eps": -1.0, "edge_aware": True}, ValueError, "eps: .*above 0, got -1.0"),
+        ((4, 5, 3), (4, 5, 1), {"eps": np.array([0.1, np.nan, 0.1])}, ValueError, "eps: .*above 0, got nan"),
+        ((4, 5, 3), (4, 5, 1), {"radius": 2.5}, ValueError, "radius: expected a whole number >= 0, got 2.5"),
+        ((4, 5, 3), (4, 5, 1), {"subsample": 1.5}, ValueError, "subsample: expected a whole number >= 1, got 1.5"),
     ],
 )
 def test_bad_input_is_refused(guide, image, options, error, message):
