@@ -145,6 +145,11 @@ def test_help(argv, capsys):
     assert "usage: jaxrender" in capsys.readouterr().out
 
 
+def test_the_package_is_a_command():
+    done = subprocess.run([sys.executable, "-m", "jaxrender", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("jaxrender ")
+
+
 def test_version(capsys):
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("jaxrender 0.")

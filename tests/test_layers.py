@@ -14,8 +14,8 @@ PACKAGES = ("jaxrender", "torchref", "fitting", "benchmarks")
 
 GROUND = {"scene", "camera", "vecmath", "warp", "brdf", "metrics", "checks", "machine", "srgb", "sh_basis"}
 COMMANDS = {
-    "cli", "console", "denoise_command", "denoise_inputs", "denoise_page", "doctor", "quad_costs", "quads_command",
-    "render_command",
+    "__main__", "cli", "console", "denoise_command", "denoise_inputs", "denoise_page", "doctor", "quad_costs",
+    "quads_command", "render_command",
 }  # fmt: skip
 
 #: Part of jaxrender -> the other parts it may import. Data runs from the first line to the last.
