@@ -72,7 +72,8 @@ def read_exr_layers(path: str | os.PathLike) -> dict[str, Num[np.ndarray, "h w c
     layers: dict[str, np.ndarray] = {}
     with _open(path, header_only=False) as file:
         if len(file.parts) != len(parts):
-            checks.bad_input(path, "pixels", expected=f"{len(parts)} parts", got=f"{len(file.parts)}")
+            expected = f"those of {len(parts)} images, as the header says"
+            checks.bad_input(path, "pixels", expected=expected, got="a file that is cut off or damaged")
         for index, part in enumerate(parts):
             channels = {name: channel.pixels for name, channel in file.channels(index).items()}
             for name, pixels in channels.items():
