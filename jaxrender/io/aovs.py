@@ -15,8 +15,8 @@ from jaxrender.checks import bad_input
 from jaxrender.io.exr import group_channels, read_exr_header, read_exr_layers
 from jaxrender.io.layer_names import LIGHT_LOBES, AovNames
 
-#: Images with one channel; all others have three.
-SINGLE = ("depth", "ao")
+#: Images with one channel; all others have three, but ambient occlusion any number.
+SINGLE = ("depth",)
 #: Light adds up where a sum differs by less than this share of its parts: four roundings to half floats.
 SUM_TOLERANCE = 4 * 2.0**-11
 #: Share of the pixels that may differ by more: a renderer clamps some.
@@ -102,10 +102,10 @@ def pick_layers(file: LayeredFile, aov: str, layer: str | None = None) -> tuple[
 
 
 def aov_image(file: LayeredFile, aov: str, layers: Sequence[str]) -> Float[np.ndarray, "h w c"]:
-    """The image `aov` of one layer, or of three that are its x, y and z: with 1 channel or 3, as `filters.Aovs` has it.
+    """The image `aov` of one layer, or of three that are its x, y and z, with as many channels as `filters.Aovs` has.
 
     Gray is repeated where there should be colors, alpha is dropped, and of colors that are all equal one is taken where
-    one is wanted; ambient occlusion is the mean of its colors.
+    one is wanted. Of ambient occlusion all channels are taken that differ: they may be of rays of several lengths.
 
     Raises:
       InputError: if the layer has another number of channels, or holds integers.
@@ -115,17 +115,28 @@ def aov_image(file: LayeredFile, aov: str, layers: Sequence[str]) -> Float[np.nd
     if not np.issubdtype(pixels.dtype, np.floating):
         bad_input(file.path, field, expected=f"floating point ({aov})", got=f"integers ({pixels.dtype})")
     count = pixels.shape[-1]
+    if aov == "ao":
+        return _different(pixels[..., :3] if count == 4 else pixels)
     if count not in (1, 3, 4):
         bad_input(file.path, field, expected=f"1, 3 or 4 channels ({aov})", got=f"{count}")
     if aov not in SINGLE:
         if count == 1 and aov in ("normal", "position"):
             bad_input(file.path, field, expected=f"3 channels ({aov})", got="1")
         return np.repeat(pixels, 3, axis=-1) if count == 1 else np.ascontiguousarray(pixels[..., :3])
-    if count == 1 or aov == "ao":
-        return pixels[..., : min(count, 3)].mean(axis=-1, keepdims=True)
+    if count == 1:
+        return pixels
     if not np.array_equal(pixels[..., 1:3], pixels[..., [0, 0]], equal_nan=True):
         bad_input(file.path, field, expected=f"1 channel, or 3 that are equal ({aov})", got=f"{count} that differ")
     return np.ascontiguousarray(pixels[..., :1])
+
+
+def _different(pixels: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w k"]:
+    """The channels without those that equal an earlier one."""
+    kept: list[int] = []
+    for index in range(pixels.shape[-1]):
+        if not any(np.array_equal(pixels[..., index], pixels[..., other], equal_nan=True) for other in kept):
+            kept.append(index)
+    return np.ascontiguousarray(pixels[..., kept])
 
 
 def _samples_per_pixel(path: pathlib.Path) -> float | None:
