@@ -44,10 +44,11 @@ from jaxrender import console
 from jaxrender.filters.aovs import Aovs
 from jaxrender.filters.atrous import atrous_filter
 from jaxrender.filters.bilateral import cross_bilateral_filter
-from jaxrender.filters.denoiser import DenoiseSettings, denoise
+from jaxrender.filters.denoiser import denoise
 from jaxrender.filters.fireflies import clamp_fireflies
 from jaxrender.filters.guided import guided_filter
 from jaxrender.filters.guides import make_guides
+from jaxrender.filters.settings import DenoiseSettings
 from jaxrender.io import write_png
 from jaxrender.io.picture import contact_sheet
 from jaxrender.metrics import flip, ssim
@@ -319,7 +320,7 @@ def _paper(cell: Cell, rounds: int) -> Result:
 def _denoised(*, ao: bool, auto: bool = False) -> Callable[[Cell, int], Result]:
     def way(cell: Cell, rounds: int) -> Result:
         settings = DenoiseSettings(samples_per_pixel=cell.first.spp, auto=auto)
-        found = [denoise(cell.aovs(render, render.ao8 if ao else None), settings) for render in cell.renders]
+        found = [denoise(cell.aovs(render, render.ao8 if ao else None), settings=settings) for render in cell.renders]
         return [one.image for one in found], {key: found[0].chosen[key] for key in ("radius", "eps")}
 
     return way

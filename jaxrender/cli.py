@@ -231,17 +231,22 @@ class Denoise:
     method: Literal["guided", "bilateral", "atrous"] = "guided"
     """The filter."""
     radius: int | None = None
-    """Of the filter, in pixels. By default a rule in samples and resolution."""
+    """Of the filter, in pixels. By default a rule in samples."""
     eps: float | None = None
     """Of the filter: factor on what tells edges from noise. By default a rule."""
     spp: float | None = None
     """Samples a pixel of the picture, for those rules. By default as the file says, if it does."""
     auto: bool = False
-    """Choose radius and eps from the picture alone, by leave-one-out cross-validation; for frames, from the first."""
+    """Choose radius and eps from the picture alone, by leave-one-out cross-validation; for frames, from the first.
+    Where neighbouring pixels share noise, as after a renderer's pixel filter, it goes by the rule and says so."""
     firefly: float | Literal["off"] = 16.0
     """Pixels brighter than this many times their neighbourhood are clamped to that; off leaves them."""
     demodulate: bool = True
     """Divide the albedo out while filtering."""
+    whole: bool = False
+    """Filter all light, also where direct and indirect light are separate; else direct light stays as it came there."""
+    keep_lamps: bool = True
+    """Leave pixels as they are that seem to show a lamp itself: bright patches without noise."""
     frames: str | None = None
     """Numbers of frames, such as 1-24 or 1,3,5-7; names then have a place for them, as noisy.####.exr or %04d."""
     resume: bool = False

@@ -35,9 +35,12 @@ IMAGE_OPTIONS = ("normal", "depth", "position", "albedo", "ao", "direct", "indir
 #: Counts of pixels, in words.
 COUNTS = {
     "nan": "NaN or Inf", "negative": "negative", "clamped": "clamped as fireflies", "filled": "filled in",
-    "raised": "below 0 after the filter and set to 0",
+    "raised": "below 0 after the filter and set to 0", "zeroed": "NaN or Inf and set to 0",
+    "guide_nan": "NaN or Inf in a guide", "too_large": "too large and cut", "lamps": "kept as lamps",
     "half_overflow": "too large for half floats",
 }  # fmt: skip
+#: Those that are told only where there are some.
+RARE = ("zeroed", "guide_nan", "too_large", "lamps", "half_overflow")
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ def run_denoise(options: "Options") -> None:
     check_jobs(jobs)
     left = [job for job in jobs if not (options.resume and job.out.exists())]
     console.announce_device()
-    settings, page, told = make_settings(options), None, set[str]()
+    settings, page, first, told = make_settings(options), None, None, set[str]()
     records: list[dict[str, Any]] = []
     with _progress(jobs, left) as advance:
         for job in left:
@@ -89,11 +92,13 @@ def run_denoise(options: "Options") -> None:
                 if note not in told:
                     console.announce(f"{done.inputs.name}: {note}")
                 told.add(note)
-            records.append(done.record())
             if page is None:
-                console.announce(f"{done.inputs.name}: {words_of(done.denoised.chosen)}")
-                page = start_page(done, stops=options.exposure_stops)
-            settings = settled(settings, done.denoised.chosen)
+                console.announce(f"{done.inputs.name}: {words_of(done.denoised.chosen)}{_for_all(jobs)}")
+                page, first = start_page(done, stops=options.exposure_stops), job.frame
+                settings = settled(settings, done.denoised.chosen)
+            else:
+                done = replace(done, denoised=_as_frame(done.denoised, first))
+            records.append(done.record())
             advance(1)
     counts = {name: sum(record["counts"].get(name, 0) for record in records) for name in COUNTS}
     paths = [path for job in left for path in (job.out, job.out.with_suffix(".png"))]
@@ -150,6 +155,9 @@ def check_jobs(jobs: Sequence[Job]) -> None:
     for job in jobs:
         if job.out.resolve() in inputs:
             bad_input("-o", str(job.out), expected="another file than those that are read", got="one of them")
+        for path in (job.out, job.out.with_suffix(".png"), job.out.with_suffix(".html")):
+            if path.is_dir():
+                bad_input("-o", str(path), expected="the name of a file", got="a folder of that name")
     for folder in {job.out.parent for job in jobs}:
         if not is_writable_folder(folder):
             bad_input("-o", str(folder), expected="a folder that can be written", got="one that cannot")
@@ -160,14 +168,12 @@ def make_settings(options: "Options") -> DenoiseSettings:
     return DenoiseSettings(
         method=options.method, radius=options.radius, eps=options.eps, samples_per_pixel=options.spp,
         auto=options.auto, firefly_factor=None if options.firefly == "off" else options.firefly,
-        demodulate=options.demodulate,
+        demodulate=options.demodulate, whole=options.whole, keep_lamps=options.keep_lamps,
     )  # fmt: skip
 
 
 def settled(settings: DenoiseSettings, chosen: Mapping[str, Any]) -> DenoiseSettings:
-    """Settings for the frames after the first: what was chosen for it stays, so that frames do not flicker."""
-    if not settings.auto:
-        return settings
+    """Settings for the frames after the first: what it was filtered with stays, so that frames do not flicker."""
     radius, eps = chosen.get("radius"), chosen.get("eps")
     return replace(
         settings, auto=False, radius=radius if isinstance(radius, int) else settings.radius,
@@ -185,7 +191,7 @@ def run_job(job: Job, settings: DenoiseSettings, options: "Options") -> Done:
     if settings.samples_per_pixel is None:
         settings = replace(settings, samples_per_pixel=inputs.samples_per_pixel)
     started = time.perf_counter()
-    denoised = denoise(inputs.aovs, settings)
+    denoised = denoise(inputs.aovs, settings=settings)
     image = np.asarray(denoised.image, np.float32)
     seconds = time.perf_counter() - started
     layers = output_layers(inputs, denoised)
@@ -241,10 +247,20 @@ def words_of(chosen: Any) -> str:
 
 def tell_counts(name: str, counts: Mapping[str, int]) -> None:
     """Says how many pixels were not as they should be; a warning if some had to be changed to be written."""
-    told = ", ".join(f"{counts[key]} {words}" for key, words in COUNTS.items() if key != "half_overflow")
+    shown = {key: words for key, words in COUNTS.items() if key not in RARE or counts[key] > 0}
+    told = ", ".join(f"{counts[key]} {words}" for key, words in shown.items() if key != "half_overflow")
     console.announce(f"{name}: of the pixels {told}")
     if counts["half_overflow"]:
         console.warn(f"{name}: {counts['half_overflow']} pixels {COUNTS['half_overflow']}, clamped to {HALF_MAX:g}")
+
+
+def _for_all(jobs: Sequence[Job]) -> str:
+    return f"; radius and eps for all {len(jobs)} frames" if len(jobs) > 1 else ""
+
+
+def _as_frame(denoised: Denoised, frame: int | None) -> Denoised:
+    """Says of a later frame where its settings come from."""
+    return replace(denoised, chosen={**denoised.chosen, "how": f"as frame {frame}"})
 
 
 def _kept(count: int, job: Job) -> str:
@@ -272,9 +288,8 @@ def start_page(done: Done, *, stops: float) -> BeforeAfterPage:
     height, width = done.inputs.aovs.color.shape[:2]
     page = BeforeAfterPage("Denoised", subtitle=f"{done.inputs.name}, {frame}{width} x {height} pixels")
     add_comparison(page, *(_shown(image, stops) for image in (done.inputs.aovs.color, done.denoised.image)))
-    filtered = "direct and indirect light apart" if done.denoised.layers else "the picture as a whole"
     chosen = {name.replace("_", " "): words_of(value) for name, value in done.denoised.chosen.items()}
-    page.section("Settings").facts({**chosen, "filtered": filtered})
+    page.section("Settings").facts(chosen)
     page.section("Images that were used").facts(done.inputs.sources)
     for note in done.inputs.notes:
         page.note(note)
@@ -284,10 +299,15 @@ def start_page(done: Done, *, stops: float) -> BeforeAfterPage:
 def add_numbers(page: BeforeAfterPage, records: Sequence[Mapping[str, Any]]) -> None:
     """Adds the counts of each frame."""
     page.section("Pixels")
+    some = {name for name in COUNTS if any(record["counts"].get(name, 0) for record in records)}
     rows = [
         {
             **({} if record["frame"] is None else {"frame": str(record["frame"])}),
-            **{words: record["counts"].get(name, 0) for name, words in COUNTS.items()},
+            **{
+                words: record["counts"].get(name, 0)
+                for name, words in COUNTS.items()
+                if name in some or name not in RARE
+            },
             "seconds": record["seconds"],
         }
         for record in records

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from jaxrender.checks import bad_input
-from jaxrender.deferred.exchange import FAR_AWAY
 from jaxrender.deferred.pipeline import render_scene
 from jaxrender.filters.aovs import Aovs
 from jaxrender.io.aovs import (
@@ -84,9 +83,6 @@ def read_inputs(noisy: str, others: Mapping[str, str]) -> DenoiseInputs:
     light, light_note = split_light(file, names, images["color"], given)
     if light is not None:
         images |= {name: getattr(light, name) for name in LIGHT if getattr(light, name) is not None}
-    for name in ("depth", "position"):
-        if name in images:
-            images[name] = _nothing_far_away(images[name])
     picture = file.layers[color]
     aovs = Aovs(**images)
     aovs.check()
@@ -107,11 +103,12 @@ def _picture_layer(file: LayeredFile, layer: str | None) -> str:
     """The layer that is the noisy picture: the one named, else the one of the view with the most layers known."""
     if layer is not None:
         return pick_layers(file, "color", layer)[0]
-    found = AovNames(file.layers).color
-    if found is not None:
-        return found
-    if len(file.layers) == 1:
-        return next(iter(file.layers))
+    names = AovNames(file.layers)
+    if names.color is not None:
+        return names.color
+    only = next(iter(file.layers))
+    if len(file.layers) == 1 and not any(only in names.find(aov) for aov in _BESIDE):
+        return only
     expected = "a picture (R, G, B, or Combined, RGBA, beauty; or --color FILE:LAYER)"
     bad_input(file.path, "layers", expected=expected, got=file.listing())
 
@@ -147,12 +144,6 @@ def _of_one_size(file: LayeredFile, color: str) -> tuple[LayeredFile, str]:
     layers = {name: pixels for name, pixels in file.layers.items() if pixels.shape[:2] == size}
     left = ", ".join(repr(name) for name in file.layers if name not in layers)
     return replace(file, layers=layers), f"layers of another size are left out: {left}" if left else ""
-
-
-def _nothing_far_away(image: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
-    """Depths or positions with 0 where renderers write a huge number or infinity for the background; NaN stays."""
-    with np.errstate(invalid="ignore"):
-        return np.where((np.abs(image) >= FAR_AWAY).any(axis=-1, keepdims=True), np.float32(0.0), image)
 
 
 def _channels(file: LayeredFile, *, without: str) -> dict[str, Num[np.ndarray, "h w 1"]]:

@@ -102,8 +102,7 @@ def test_picture_layers_and_files(tmp_path, capsys, rng, calls):
     assert read_png(tmp_path / "a" / "clean.png").shape == (HEIGHT, WIDTH, 3)
     ((aovs, settings),) = calls
     assert set(aovs.given()) == {"color", "normal", "depth", "albedo"}
-    expected = np.where(layers["Z"] < 1e9, layers["Z"], 0.0)
-    np.testing.assert_array_equal(aovs.depth, expected)
+    np.testing.assert_array_equal(aovs.depth, layers["Z"])
     assert settings == denoise_command.DenoiseSettings(samples_per_pixel=None)
 
 
@@ -114,6 +113,12 @@ def test_options_become_settings(tmp_path, capsys, rng, calls):
     assert calls[0][1] == denoise_command.DenoiseSettings(
         method="atrous", radius=3, eps=2.0, samples_per_pixel=8.0, auto=True, firefly_factor=None, demodulate=False
     )
+
+
+def test_all_light_and_lamps_by_option(tmp_path, capsys, rng, calls):
+    write_exr(tmp_path / "noisy.exr", picture_layers(rng))
+    run(capsys, tmp_path / "noisy.exr", "-o", tmp_path / "c.exr", "--whole", "--no-keep-lamps")
+    assert calls[0][1] == denoise_command.DenoiseSettings(whole=True, keep_lamps=False)
 
 
 def test_samples_come_from_the_file_unless_told(tmp_path, capsys, rng, calls):
@@ -135,7 +140,7 @@ def test_images_of_other_files_by_option(tmp_path, capsys, rng, calls):
     aovs = calls[0][0]
     np.testing.assert_array_equal(aovs.normal, files["normals"]["y"])
     np.testing.assert_array_equal(aovs.depth, files["depths"])
-    np.testing.assert_allclose(aovs.ao, files["normals"]["x"].mean(axis=-1, keepdims=True), rtol=1e-6)
+    np.testing.assert_array_equal(aovs.ao, files["normals"]["x"])
     assert record["layers"]["normal"] == "normals.exr: y" and set(read_exr_layers(tmp_path / "clean.exr")) == {""}
 
 
@@ -362,6 +367,16 @@ def test_what_auto_chose_stays_for_all_frames(tmp_path, capsys, rng, calls):
     assert (second.auto, second.radius, second.eps) == (False, 5, 0.5)
 
 
+def test_what_the_rule_gave_stays_for_all_frames(tmp_path, capsys, rng, calls):
+    """The first frame has light in all pixels, the second in few, by which the rule would choose another radius."""
+    write_frames(tmp_path, rng, [1, 2])
+    arguments = [tmp_path / "noisy.####.exr", "-o", tmp_path / "c.####.exr", "--frames", "1-2"]
+    out, err = run(capsys, *arguments, "--json")
+    assert [(settings.radius, settings.eps) for _, settings in calls] == [(None, None), (5, 0.5)]
+    assert "noisy.0001.exr: method guided, radius 5, eps 0.5; radius and eps for all 2 frames\n" in err
+    assert json.loads(out)["frames"][1]["chosen"]["how"] == "as frame 1"
+
+
 def test_an_interrupt_keeps_frames_and_resume_goes_on(tmp_path, capsys, rng, calls, monkeypatch):
     write_frames(tmp_path, rng, [1, 2, 3])
     arguments = [tmp_path / "noisy.####.exr", "-o", tmp_path / "c" / "c.####.exr", "--frames", "1-3"]
@@ -404,9 +419,13 @@ def files(tmp_path, rng):
     write_exr(tmp_path / "plain.exr", {"": image(rng), "mask": image(rng, 1)})
     write_exr(tmp_path / "whole.exr", {"": np.ones((HEIGHT, WIDTH, 3), np.uint32), "N": image(rng)})
     write_exr(tmp_path / "no_picture.exr", {"N": image(rng), "Z": image(rng, 1)})
+    write_exr(tmp_path / "only_depth.exr", {"Z": image(rng, 1)})
+    for name in ("folder.exr", "pictures.png", "page.html"):
+        (tmp_path / name).mkdir()
     (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     (tmp_path / "text.exr").write_text("not an image")
     data = (tmp_path / "good.exr").read_bytes()
+    (tmp_path / "cut.exr").write_bytes(data[: len(data) // 2])
     window = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
     for name, side in (("vast", 100_000), ("large", 60_000)):
         forged = data[: window + 8] + struct.pack("<2i", side - 1, side - 1) + data[window + 16 :]
@@ -441,6 +460,11 @@ def files(tmp_path, rng):
         (["good.exr", "--depth", "good.exr:x"], r"good\.exr: layers: expected a layer 'x', got '', 'N', 'mask'"),
         (["good.exr", "--depth", "good.exr:N"], r"layer 'N': expected 1 channel, or 3 that are equal \(depth\)"),
         (["no_picture.exr"], r"no_picture\.exr: layers: expected a picture .*, got 'N', 'Z'"),
+        (["only_depth.exr"], r"only_depth\.exr: layers: expected a picture .*, got 'Z'"),
+        (["good.exr", "-o", "folder.exr"], r"-o: .*folder\.exr: expected the name of a file, got a folder"),
+        (["good.exr", "-o", "pictures.exr"], r"-o: .*pictures\.png: expected the name of a file, got a folder"),
+        (["good.exr", "-o", "page.exr"], r"-o: .*page\.html: expected the name of a file, got a folder"),
+        (["cut.exr"], r"cut\.exr: pixels: expected those of 1 images, as the header says, got a file that is cut off"),
         (["vast.exr"], r"vast\.exr: data window: expected sides of 1 to 65536 pixels, got 100000 x 100000"),
         (["large.exr"], r"large\.exr: data window: expected at most 536870912 values, got 25200000000"),
         (["good.exr", "-o", "good.exr"], "-o: .*good.exr: expected another file than those that are read, got one"),
@@ -486,6 +510,29 @@ def test_deep_images_are_refused_by_name(tmp_path, capsys, rng, calls):
 
 
 # --- The filters themselves
+
+
+def test_what_was_filtered_is_said(tmp_path, capsys, rng):
+    """Direct light stays as it came, unless all light is asked for; the parts add up in any case."""
+    direct, indirect = image(rng), image(rng)
+    write_exr(tmp_path / "noisy.exr", {"": direct + indirect, "direct": direct, "indirect": indirect, "N": image(rng)})
+    for options, words, same in (
+        ([], "filtered indirect light, direct as it came", True),
+        (["--whole"], "filtered direct and indirect light", False),
+    ):
+        err = run(capsys, tmp_path / "noisy.exr", "-o", tmp_path / "clean.exr", "--spp", "4", *options).err
+        assert f", {words}\n" in err
+        assert words.removeprefix("filtered ") in Page((tmp_path / "clean.html").read_text()).text
+        back = read_exr_layers(tmp_path / "clean.exr")
+        assert np.array_equal(back["direct"], direct) == same
+        np.testing.assert_allclose(back["direct"] + back["indirect"], back[""], rtol=1e-6)
+
+
+def test_guides_without_a_use_are_refused_in_one_line(tmp_path, capsys, rng):
+    for value in (0.0, np.nan):
+        write_exr(tmp_path / "noisy.exr", {"": image(rng), "N": np.full((HEIGHT, WIDTH, 3), value, np.float32)})
+        line = fails(capsys, tmp_path / "noisy.exr", "-o", tmp_path / "clean.exr")
+        assert line == "normal: expected finite numbers other than 0 in some pixel, got 0 of 768"
 
 
 def test_parts_filtered_by_the_real_filter_add_up(tmp_path, capsys, rng):

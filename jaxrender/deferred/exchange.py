@@ -15,10 +15,8 @@ from jaxrender.checks import bad_input, check_one_of
 from jaxrender.deferred.gbuffer import GBuffer
 from jaxrender.deferred.packing import positions_from_depth
 from jaxrender.deferred.texture import texture_derivatives
+from jaxrender.filters.aovs import FAR_AWAY
 from jaxrender.vecmath import dot, normalize
-
-#: Depths from here on mean that nothing is there: Blender writes 1e10, others infinity.
-FAR_AWAY = 1e9
 
 # Fields of `GBuffer` that are layers of the same name, and layers of ids with their field.
 _FIELDS = ("normal", "geometric_normal", "position", "depth", "uv", "motion")

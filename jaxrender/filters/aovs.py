@@ -7,6 +7,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+#: Depths and positions from here on mean that nothing is there: Blender writes 1e10, others infinity.
+FAR_AWAY = 1e9
+
 #: Fields with one channel; all others but `ao` have three.
 _SINGLE = ("depth",)
 
@@ -23,8 +26,8 @@ class Aovs:
         that are given add up to `color`.
       albedo: reflectance in [0, 1], 0 where nothing is.
       normal: of length 1 in any frame, 0 where nothing is.
-      depth: along the axis or along the ray, in any unit, 0 where nothing is.
-      position: in any frame and unit, 0 where nothing is.
+      depth: along the axis or along the ray, in any unit; where nothing is 0, infinite or at least `FAR_AWAY`.
+      position: in any frame and unit; where nothing is as depth.
       ao: ambient occlusion, 1 for an open place; one channel, or several, of rays of different lengths.
     """
 

@@ -9,15 +9,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxrender.filters.aovs import Aovs
 from jaxrender.filters.atrous import atrous_filter
 
 #: Regularisers of the guided filter, sigmas of the others. The paper's (1e-2 for normals and depth) smooth too much:
 #: with them the error hardly falls with the number of samples.
-EPS = {"normal": 1e-3, "depth": 1e-4, "position": 1e-4, "ao": 1e-3}
-SIGMA = {"normal": 0.15, "depth": 0.01, "position": 0.02, "ao": 0.2}
+EPS = {"normal": 1e-3, "depth": 1e-4, "position": 1e-4, "ao": 1e-3, "patch": 1e-4}
+SIGMA = {"normal": 0.15, "depth": 0.01, "position": 0.02, "ao": 0.2, "patch": 0.1}
 
 #: Ambient occlusion of few rays is noisy, and a guide's noise goes into the picture: so many à-trous levels before use.
 _AO_LEVELS = 2
@@ -34,7 +34,7 @@ class Guides(NamedTuple):
 def make_guides(aovs: Aovs) -> Guides:
     """Normals, depth (positions if there is none) and ambient occlusion, as far as they are given.
 
-    Runs on the host: the extent of the scene is read off the images.
+    Runs on the host: the extent of the scene is read off the images. Pixels that are not finite stay so: see `gaps`.
 
     Raises:
       ValueError: if none of normal, depth and position is given.
@@ -70,10 +70,14 @@ def scene_extent(aovs: Aovs) -> float:
     return float(size) if size > 0.0 else 1.0
 
 
-def seen_surface(aovs: Aovs) -> np.ndarray:
-    """Where a surface is seen, (h, w): where any of normal, depth and position is given and not 0."""
-    given = [image for image in (aovs.normal, aovs.depth, aovs.position) if image is not None]
-    return np.any([np.any(np.asarray(image) != 0.0, axis=-1) for image in given], axis=0)
+def with_patches(guides: Guides, patches: Bool[np.ndarray, "h w"]) -> Guides:
+    """Guides with one more, if there are patches: 1 in them, 0 elsewhere, so that each is filtered by itself."""
+    if not patches.any():
+        return guides
+    mask = jnp.asarray(patches[..., None], jnp.float32)
+    more = (guides.eps, EPS["patch"]), (guides.sigma, SIGMA["patch"])
+    eps, sigma = (np.append(values, np.float32(value)) for values, value in more)
+    return Guides(jnp.concatenate([guides.channels, mask], axis=-1), eps, sigma)
 
 
 def _each(found: dict, table: dict[str, float]) -> Float[np.ndarray, " g"]:

@@ -25,7 +25,12 @@ PAIRED = (
 UNPAIRED_MODULES = {
     "harmonics.pipeline": "the order of the stages, no arithmetic",
     "filters.aovs": "a record of the host: images by name, and a check of shapes",
-    "filters.denoiser": "runs on the host: the order of the kernels and the choice of settings",
+    "filters.denoiser": "runs on the host: the order of the kernels",
+    "filters.settings": "settings of the denoiser, and the kernel they stand for",
+    "filters.choice": "runs on the host: the choice of settings, by numbers found in searches",
+    "filters.light": "runs on the host: which light is filtered",
+    "filters.lamps": "runs on the host: what stands out in a picture",
+    "filters.gaps": "runs on the host: guides where they are not finite",
     "filters.guides": "runs on the host: reads the extent of the scene off the images",
     "filters.bands": "pieces of an image; held against the whole in tests/filters",
     "filters.windows": "how jaxrender sums; torchref sums each window",
