@@ -31,15 +31,25 @@ def sparse_noise(height: int, width: int, *, lit: float, seed: int = 1) -> np.nd
 
 def brute_force(image, *, factor=6.0, radius=2) -> tuple[np.ndarray, np.ndarray]:
     image = np.asarray(image, np.float64)
-    light = image @ (REC_709 if image.shape[2] == 3 else np.ones(1))
-    light = np.where(np.isfinite(image).all(-1), light, 0.0)
-    result, clamped = image.copy(), np.zeros(light.shape, bool)
-    for y, x in np.ndindex(light.shape):
-        window = light[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]
-        limit = factor * np.median(window[window > 0.0]) if light[y, x] > 0.0 else math.inf
-        if light[y, x] > limit:
-            clamped[y, x], result[y, x] = True, image[y, x] * limit / light[y, x]
-    return result, clamped
+    measures = [image @ (REC_709 if image.shape[2] == 3 else np.ones(1)), image.max(-1)]
+    scale = np.ones(image.shape[:2])
+    for measure, times in zip(measures, (factor, 2.0 * factor), strict=True):
+        light = np.where(np.isfinite(image).all(-1), measure, 0.0)
+        for y, x in np.ndindex(light.shape):
+            window = light[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]
+            limit = times * np.median(window[window > 0.0]) if light[y, x] > 0.0 else math.inf
+            if light[y, x] > limit:
+                scale[y, x] = min(scale[y, x], limit / light[y, x])
+    return np.where((scale < 1.0)[..., None], image * scale[..., None], image), scale < 1.0
+
+
+def clamped_by_luminance(image) -> np.ndarray:
+    """Whether it is the luminance, and not the largest channel, that exceeds its median the more; factor 2."""
+    excess = []
+    for measure, factor in ((image @ REC_709, 2.0), (image.max(-1), 4.0)):
+        gray = brute_force(measure[..., None], factor=factor)[0][..., 0]
+        excess.append(np.divide(gray, measure, out=np.ones_like(gray), where=measure > 0.0))
+    return excess[0] < excess[1]
 
 
 # --- Against loops
@@ -91,10 +101,24 @@ def test_a_firefly_comes_down_to_the_limit_and_keeps_its_hue():
     image[4, 4] = [800.0, 100.0, 20.0]
     found, clamped = run(image)
     assert clamped.sum() == 1 and clamped[4, 4]
-    np.testing.assert_allclose(found[4, 4] @ REC_709, 6.0 * 0.5, rtol=1e-6)
+    np.testing.assert_allclose(found[4, 4].max(), 2.0 * 6.0 * 0.5, rtol=1e-6)
     np.testing.assert_allclose(found[4, 4] / found[4, 4, 0], image[4, 4] / image[4, 4, 0], rtol=1e-6)
     found[4, 4] = image[4, 4]
     np.testing.assert_array_equal(found, image)
+
+
+@pytest.mark.parametrize("hue", [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.3], [1.0, 1.0, 1.0]])
+def test_saturated_fireflies_are_held_by_their_largest_channel(hue):
+    image = np.full((9, 9, 3), 0.1, np.float32)
+    image[4, 4] = 20.0 * np.array(hue)
+    found, clamped = run(image, factor=16.0)
+    assert clamped.sum() == 1
+    largest = min(3.2, 1.6 / (np.array(hue) @ REC_709))
+    np.testing.assert_allclose(found[4, 4], largest * np.array(hue), rtol=1e-5, atol=1e-7)
+    # In light of its own colour it is measured by that.
+    blue = np.full((9, 9, 3), [0.01, 0.01, 2.0], np.float32)
+    blue[4, 4] = [0.0, 0.0, 20.0]
+    assert not run(blue, factor=16.0)[1].any()
 
 
 def test_twelve_fireflies_in_a_window_of_25_are_all_found():
@@ -181,15 +205,19 @@ def test_with_and_without_jit_and_in_batches():
 
 
 def test_medians_count_as_constants_in_derivatives(x64, rng):
-    """So a clamped pixel c turns as c · (limit / luminance), and others as they are."""
+    """So a clamped pixel c turns as c · (limit / measure), and others as they are."""
     image, along = sparse_noise(8, 9, lit=0.7).astype(np.float64), rng.normal(size=(8, 9, 3))
     slope = jax.jit(jax.grad(lambda i: jnp.sum(clamp_fireflies(i, factor=2.0)[0] * along)))(image)
     found, clamped = brute_force(image, factor=2.0)
     assert clamped.sum() > 3
-    light, limit = image @ REC_709, found @ REC_709
     with np.errstate(divide="ignore", invalid="ignore"):
-        by_light = (along * image).sum(-1) * limit / light**2
-        expected = along * (limit / light)[..., None] - by_light[..., None] * REC_709
+        scale = found.sum(-1) / image.sum(-1)
+        expected = 0.0
+        for by_luminance in (True, False):
+            weights = REC_709 if by_luminance else (image == image.max(-1, keepdims=True)).astype(float)
+            light = (image * weights).sum(-1)
+            own = along * scale[..., None] - ((along * image).sum(-1) * scale / light)[..., None] * weights
+            expected = expected + np.where((clamped_by_luminance(image) == by_luminance)[..., None], own, 0.0)
     np.testing.assert_allclose(slope, np.where(clamped[..., None], expected, along), rtol=1e-12, atol=1e-14)
 
 
