@@ -48,6 +48,9 @@ def guided_filter(
     columns, so the rounding of a spike stays below it for some dozen rows: of one 10⁶ times as bright as the rest a few
     hundredths of the rest. Clamp spikes first (`clamp_fireflies`).
 
+    Where guide and image are the same array (`guided_filter(x, x, ...)`, also of one traced `x`), each window sum is
+    taken once, with the same result up to rounding.
+
     Differentiable in guide, image and eps, by a rule of its own that keeps only the arguments and makes about
     5 (g + 1) (g + c + 1) planes on the way back.
 
@@ -69,6 +72,7 @@ def guided_filter(
     _check(guide, image, radius=radius, subsample=subsample)
     checks.check_above_0("eps", eps)
     centers = center_of(guide, image)
+    centers = (centers[0], centers[0]) if guide is image else centers
     ridge = edge_aware_eps(guide, eps=eps) if edge_aware else eps
     return filter_centered(guide, image, *centers, radius=radius, eps=ridge, subsample=subsample)
 
@@ -107,7 +111,11 @@ def filter_centered(
         lambda: guide_planes,
         lambda: _filled(guide, radius) - guide_center[:, None, None],
     )
-    if subsample == 1:
+    # Where the image is its own guide; masked pixels, which differ, are in no sum.
+    image_planes = seen if guide is image and guide_center is image_center else image_planes
+    if subsample == 1 and image_planes is seen:
+        planes = _filtered_by_itself(seen, valid, eps_planes, radius)
+    elif subsample == 1:
         planes = _filtered(seen, image_planes, valid, eps_planes, radius)
     else:
         planes = _fast(seen, image_planes, valid, eps_planes, radius, subsample)
@@ -150,7 +158,11 @@ def _coefficients(guide: GuidePlanes, image: Planes, valid, eps, radius: int) ->
     """b and a, summed over the windows that cover each pixel."""
     weight = valid.astype(guide.dtype)[None]
     u = jnp.concatenate([jnp.ones_like(guide[:1]), guide]) * weight
-    sums = box_sums(u[:, None] * jnp.concatenate([u, image * weight])[None], radius=radius)
+    if image is guide:
+        sums = box_sums(u[:, None] * u[None], radius=radius)
+        sums = jnp.concatenate([sums, sums[:, 1:]], axis=1)
+    else:
+        sums = box_sums(u[:, None] * jnp.concatenate([u, image * weight])[None], radius=radius)
     return box_sums(_solve(sums, eps), radius=radius)
 
 
@@ -203,12 +215,37 @@ def _backward(radius, saved, slope):
 _filtered.defvjp(_forward, _backward)
 
 
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _filtered_by_itself(guide: GuidePlanes, valid: Bool[Array, "h w"], eps: Float[Array, "g #h #w"], radius: int):
+    return lax.platform_dependent(
+        guide,
+        valid,
+        eps,
+        cpu=lambda guide, *rest: filter_rows(guide, None, *rest, radius=radius),
+        default=lambda guide, *rest: filter_planes(guide, guide, *rest, radius=radius),
+    )
+
+
+def _forward_by_itself(guide, valid, eps, radius):
+    return _filtered_by_itself(guide, valid, eps, radius), (guide, valid, eps)
+
+
+def _backward_by_itself(radius, saved, slope):
+    guide, valid, eps = saved
+    of_guide, of_image, _, of_eps = _backward(radius, (guide, guide, valid, eps), slope)
+    return of_guide + of_image, None, of_eps
+
+
+_filtered_by_itself.defvjp(_forward_by_itself, _backward_by_itself)
+
+
 def _fast(guide: GuidePlanes, image: Planes, valid, eps, radius: int, step: int) -> Planes:
     """Coefficients from means of step x step pixels, enlarged to the whole guide."""
     weight = valid.astype(guide.dtype)[None]
     count = _block_sums(weight, step)
     inverse = 1.0 / jnp.maximum(count, jnp.ones_like(count))
-    small_guide, small_image = (_block_sums(x * weight, step) * inverse for x in (guide, image))
+    small_guide = _block_sums(guide * weight, step) * inverse
+    small_image = small_guide if image is guide else _block_sums(image * weight, step) * inverse
     if eps.shape[1:] != (1, 1):
         eps = _block_sums(eps, step) / _block_sums(jnp.ones_like(weight), step)
     small_radius = max(1, round(radius / step))

@@ -29,8 +29,8 @@ def restart_rows(radius: int) -> int:
 class _Walk(NamedTuple):
     """What a step hands to the next one, which is about to do row t."""
 
-    rows: tuple[Float[Array, "k wp"], ...]  # places for two rows: 1, guide and image, with zeros at both ends
-    sums: Float[Array, "n k wp"]  # of products down the columns, rows t - 1 - r to t - 1 + r
+    rows: tuple[Float[Array, "kr wp"], ...]  # places for two rows: 1, guide and image, with zeros at both ends
+    sums: Float[Array, "n kr wp"]  # of products down the columns, rows t - 1 - r to t - 1 + r
     stages: tuple[Float[Array, "n+1 _ w"], ...]  # places for the normal equations, from the pivot's column on
     ring: Float[Array, "l+2 n c wp"]  # coefficients: row y at y modulo l + 1; zeros at l + 1
     coefficients: Float[Array, "n c wp"]  # sums of the last l rows of them
@@ -40,16 +40,17 @@ class _Walk(NamedTuple):
 
 def filter_rows(
     guide: Float[Array, "g h w"],
-    image: Float[Array, "c h w"],
+    image: Float[Array, "c h w"] | None,
     valid: Bool[Array, "h w"],
     eps: Float[Array, "g #h #w"],
     *,
     radius: int,
 ) -> Float[Array, "c h w"]:
-    """The same as `guided.filter_planes`, up to rounding."""
+    """The same as `guided.filter_planes`, up to rounding. With None for the image, the guide is filtered by itself."""
     g, height, width = guide.shape
+    images = [] if image is None else [image]
     reach_y, reach_x = min(radius, height - 1), min(radius, width - 1)
-    length, n, c = 2 * reach_y + 1, g + 1, image.shape[0]
+    length, n, c = 2 * reach_y + 1, g + 1, g if image is None else image.shape[0]
     counts_y, counts_x = (1.0 / x.astype(guide.dtype) for x in window_counts(height, width, radius=radius))
 
     def inside(y):
@@ -58,7 +59,8 @@ def filter_rows(
     def fetch(place, y):
         at = jnp.clip(y, 0, height - 1)
         weight = (_row(valid, at) & inside(y)).astype(guide.dtype)[None]
-        for start, row in ((0, weight), (1, _row(guide, at) * weight), (n, _row(image, at) * weight)):
+        rows = [weight, *(_row(planes, at) * weight for planes in (guide, *images))]
+        for start, row in zip((0, 1, n), rows, strict=False):
             place = lax.dynamic_update_slice(place, row, (start, reach_x))
         return place
 
@@ -71,6 +73,10 @@ def filter_rows(
 
     def window_sums(values):
         return neighbour_sums(values, length=2 * reach_x + 1)
+
+    def equations(m):
+        """Of the guide by itself, the right-hand sides are among the products of its channels."""
+        return m if images else jnp.concatenate([m, m[:, 1:]], axis=1)
 
     def pivot(j: int, m, pixels, y):
         divisor = pixels
@@ -86,7 +92,7 @@ def filter_rows(
         leaving, gone = (jnp.where(t == first, -1, t - 1 - rows) for rows in (reach_y, 2 * reach_y))
         rows = fetch(walk.rows[0], t + reach_y), fetch(walk.rows[1], leaving)
         sums = walk.sums + (products(rows[0]) - products(rows[1]))
-        stages = [_put(walk.stages[0], window_sums(sums), t)]
+        stages = [_put(walk.stages[0], equations(window_sums(sums)), t)]
         pixels = jnp.maximum(stages[0][0, 0], jnp.ones_like(counts_x))
         for j in range(n - 1):
             stages.append(_put(walk.stages[j + 1], pivot(j, stages[j][:n], pixels, t), t))
@@ -123,10 +129,10 @@ def filter_rows(
         return lax.fori_loop(start, jnp.minimum(start + every, num_steps), lambda t, w: step(t, w, start), walk)
 
     zeros = lambda *shape: jnp.zeros(shape, guide.dtype)  # noqa: E731
-    k, padded = n + c, width + 2 * reach_x
+    k, k_rows, padded = n + c, n + c * len(images), width + 2 * reach_x
     start = _Walk(
-        rows=(zeros(k, padded), zeros(k, padded)),
-        sums=zeros(n, k, padded),
+        rows=(zeros(k_rows, padded), zeros(k_rows, padded)),
+        sums=zeros(n, k_rows, padded),
         stages=tuple(zeros(n + 1, k - j, width) for j in range(n)),
         ring=zeros(length + 2, n, c, padded),
         coefficients=zeros(n, c, padded),

@@ -7,7 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrender.filters import box_mean, guided_filter, guided_filter_in_bands, in_bands
+from jaxrender.filters import (
+    atrous_filter,
+    box_mean,
+    cross_bilateral_filter,
+    guided_filter,
+    guided_filter_in_bands,
+    in_bands,
+)
 from jaxrender.filters.guided_rows import restart_rows
 
 
@@ -78,6 +85,27 @@ def test_any_filter_with_its_halo(rows):
     bands = list(in_bands(mean, (image,), rows=rows, halo=3))
     assert [len(band) for band in bands] == [min(rows, 45 - start) for start in range(0, 45, rows)]
     np.testing.assert_array_equal(np.concatenate(bands), mean(image))
+
+
+@pytest.mark.parametrize(
+    ("function", "halo"),
+    [
+        (functools.partial(cross_bilateral_filter, radius=4, sigma_spatial=2.0, sigma_features=0.3), 4),
+        (functools.partial(atrous_filter, num_levels=3, sigma_features=0.3), 14),
+        (functools.partial(atrous_filter, num_levels=2, sigma_features=0.3, sigma_color=0.5), 6),
+    ],
+    ids=["bilateral", "atrous", "atrous with colour"],
+)
+def test_the_halos_that_rivals_need(function, halo):
+    """Those in the docstring of `in_bands`: enough for the same bits, and one row less is not."""
+    guide, image = images(60, 13, g=2, c=1)
+    image = np.clip(image, 0.0, 1e3)
+    compiled = jax.jit(function, compiler_options={"xla_backend_optimization_level": 0})
+    whole = np.asarray(compiled(image, guide))
+    found = np.concatenate(list(in_bands(compiled, (image, guide), rows=20, halo=halo)))
+    np.testing.assert_array_equal(found, whole)
+    short = np.concatenate(list(in_bands(compiled, (image, guide), rows=20, halo=halo - 1)))
+    assert (short != whole).any()
 
 
 def test_halos_and_channels_may_differ():

@@ -53,6 +53,21 @@ def check_by_finite_differences(function, values):
                 np.testing.assert_allclose(np.sum(slope * along), expected, rtol=1e-6, atol=1e-7)
 
 
+def test_derivatives_of_an_image_that_guides_itself(x64):
+    """Those to guide and image, added up."""
+    guide, _, eps = arguments((3,))
+    mix = jnp.asarray(np.random.default_rng(5).normal(size=guide.shape))
+
+    def total(guide, image, eps):
+        return jnp.sum(guided_filter(guide, image, radius=1, eps=eps) * mix)
+
+    with jax.debug_nans(False):
+        apart = quick(jax.grad(total, argnums=(0, 1, 2)))(guide, guide.copy(), eps)
+        found = quick(jax.grad(lambda x, eps: total(x, x, eps), argnums=(0, 1)))(guide, eps)
+    np.testing.assert_allclose(found[0], apart[0] + apart[1], rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(found[1], apart[2], rtol=1e-9, atol=1e-11)
+
+
 @pytest.mark.parametrize("eps_shape", [(), (3,), (*SIZE, 1), (*SIZE, 3)])
 def test_derivatives_are_finite_differences(eps_shape, x64):
     function = value_and_slopes()
