@@ -199,14 +199,15 @@ def run_job(job: Job, settings: DenoiseSettings, options: "Options") -> Done:
     if options.half:
         layers, counts["half_overflow"] = within_half(layers)
     write_png(job.out.with_suffix(".png"), tone_map(image, exposure_stops=options.exposure_stops))
-    write_exr(job.out, layers, half=options.half)
+    write_exr(job.out, layers, half=options.half, attributes=inputs.attributes)
     return Done(job, inputs, denoised, counts, seconds)
 
 
 def output_layers(inputs: DenoiseInputs, denoised: Denoised) -> dict[str, Num[np.ndarray, "h w c"]]:
     """The picture as layer "", its filtered parts, which add up to it, and all other channels as they came.
 
-    A part that is a layer of the file takes its place; others are layers "direct", "indirect" and "emission".
+    A picture of one channel keeps its name. A part that is a layer of the file takes its place; others are layers
+    "direct", "indirect" and "emission".
     """
     picture = np.asarray(denoised.image, np.float32)[..., : 1 if inputs.gray else 3]
     if inputs.alpha is not None:
@@ -217,7 +218,7 @@ def output_layers(inputs: DenoiseInputs, denoised: Denoised) -> dict[str, Num[np
         if values is not None:
             names = inputs.replaced.get(part, (f"{part}.R", f"{part}.G", f"{part}.B"))
             layers |= {names[index]: np.asarray(values, np.float32)[..., index : index + 1] for index in range(3)}
-    return {"": picture, **layers}
+    return {inputs.gray if inputs.gray not in ("", "Y") else "": picture, **layers}
 
 
 def within_half(layers: Mapping[str, Num[np.ndarray, "h w c"]]) -> tuple[dict[str, np.ndarray], int]:

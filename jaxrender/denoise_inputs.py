@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Num
@@ -19,6 +20,7 @@ from jaxrender.io.aovs import (
     split_reference,
 )
 from jaxrender.io.builtin_scene import builtin_scene
+from jaxrender.io.exr import exr_attributes, read_exr_header
 from jaxrender.io.layer_names import AovNames
 from jaxrender.render_command import picture_layers
 from jaxrender.scene import whole_scene_camera
@@ -40,23 +42,25 @@ class DenoiseInputs:
 
     Attributes:
       name: of the picture, for messages.
-      alpha: (h, w, 1) of the picture, None without. gray: the picture had one channel.
+      alpha: (h, w, 1) of the picture, None without. gray: the picture had one channel, and its name.
       sources: which layer each image is, for people.
       channels: all of the file but the picture, by full name, to be handed on.
       replaced: filtered part of the light -> the channels it has in the file, if it is a layer there.
       notes: what people should be told.
       samples_per_pixel: as the file says, None where it does not.
+      attributes: of the file's header, to be handed on.
     """
 
     name: str
     aovs: Aovs
     alpha: Float[np.ndarray, "h w 1"] | None = None
-    gray: bool = False
+    gray: str = ""
     sources: Mapping[str, str] = field(default_factory=dict)
     channels: Mapping[str, Num[np.ndarray, "h w 1"]] = field(default_factory=dict)
     replaced: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     samples_per_pixel: float | None = None
+    attributes: Mapping[str, Any] = field(default_factory=dict)
 
 
 def read_inputs(noisy: str, others: Mapping[str, str]) -> DenoiseInputs:
@@ -90,13 +94,20 @@ def read_inputs(noisy: str, others: Mapping[str, str]) -> DenoiseInputs:
         path.name,
         aovs,
         alpha=picture[..., 3:4] if picture.shape[-1] == 4 else None,
-        gray=picture.shape[-1] == 1,
+        gray=(file.channels[color][0] if color == "" else "Y") if picture.shape[-1] == 1 else "",
         sources=sources,
         channels=_channels(file, without=color),
         replaced={} if light is None else {part: file.channels[layer] for part, layer in light.layers.items()},
         notes=tuple(note for note in (cut_note, light_note) if note),
         samples_per_pixel=file.samples_per_pixel,
+        attributes=_attributes(file, picture),
     )
+
+
+def _attributes(file: LayeredFile, picture: np.ndarray) -> dict[str, Any]:
+    """Of the header, where it is that of the picture: one of another part may have another size."""
+    first = read_exr_header(file.path)[0]
+    return exr_attributes(file.path) if (first.height, first.width) == picture.shape[:2] else {}
 
 
 def _picture_layer(file: LayeredFile, layer: str | None) -> str:

@@ -173,6 +173,35 @@ def test_a_gray_picture_stays_gray(tmp_path, capsys, rng, calls):
     np.testing.assert_allclose(read_exr_layers(tmp_path / "clean.exr")[""], mean3(gray), rtol=1e-6)
 
 
+@pytest.mark.parametrize("channel", ["Y", "R", "G"])
+def test_a_lone_channel_keeps_its_name(tmp_path, capsys, rng, calls, channel):
+    planes = {name: image(rng, 1)[..., 0] for name in (channel, "N.X", "N.Y", "N.Z")}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, dict(planes)).write(str(tmp_path / "noisy.exr"))
+    run(capsys, tmp_path / "noisy.exr", "-o", tmp_path / "clean.exr")
+    (part,) = read_exr_header(tmp_path / "clean.exr")
+    assert set(part.channels) == set(planes)
+
+
+def test_the_header_stays(tmp_path, capsys, rng, calls):
+    """A crop of a larger picture stays where it was, pixels keep their shape, and notes of the renderer stay."""
+    window = tuple(np.array(corner, np.int32) for corner in ((10, 12), (10 + WIDTH - 1, 12 + HEIGHT - 1)))
+    display = tuple(np.array(corner, np.int32) for corner in ((0, 0), (63, 47)))
+    header = {
+        "compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage, "dataWindow": window,
+        "displayWindow": display, "pixelAspectRatio": 2.0, "cryptomatte/abc/manifest": "{}", "owner": "somebody",
+    }  # fmt: skip
+    planes = {name: image(rng, 1)[..., 0] for name in ("R", "G", "B", "N.X", "N.Y", "N.Z")}
+    OpenEXR.File(header, planes).write(str(tmp_path / "noisy.exr"))
+    run(capsys, tmp_path / "noisy.exr", "-o", tmp_path / "clean.exr")
+    with OpenEXR.File(str(tmp_path / "clean.exr"), header_only=True) as file:
+        back = dict(file.header(0))
+    np.testing.assert_array_equal(back["dataWindow"], window)
+    np.testing.assert_array_equal(back["displayWindow"], display)
+    assert back["pixelAspectRatio"] == 2.0 and back["cryptomatte/abc/manifest"] == "{}"
+    assert back["owner"] == "somebody" and back["compression"] == OpenEXR.ZIP_COMPRESSION
+
+
 # --- Light in parts
 
 

@@ -15,6 +15,7 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -31,6 +32,12 @@ _MAX_TILE_VALUES = 2**26
 
 # Components that stand together, in the order they take in the array.
 _FAMILIES = ("RGBA", "XYZW", "UV")
+
+# What of a header belongs to the way a file is stored, not to the picture.
+_STORAGE = {
+    "channels", "chunkCount", "compression", "dwaCompressionLevel", "lineOrder", "maxSamplesPerPixel", "name", "tiles",
+    "type", "version", "zipCompressionLevel",
+}  # fmt: skip
 
 _output_lock = threading.Lock()
 
@@ -106,17 +113,41 @@ def read_exr_header(path: str | os.PathLike) -> tuple[ExrPart, ...]:
     return tuple(parts)
 
 
+def exr_attributes(path: str | os.PathLike) -> dict[str, Any]:
+    """What the header of the first part says of the picture: windows, the shape of pixels, notes of the renderer.
+
+    For `write_exr`, of pictures of the same size. Only windows, numbers and texts, and pairs of numbers.
+
+    Raises:
+      InputError: as `read_exr_header`.
+    """
+    with _open(path, header_only=True) as file:
+        header = file.header(0)
+        kept = {name: value for name, value in header.items() if name not in _STORAGE and _is_plain(value)}
+        return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in kept.items()}
+
+
+def _is_plain(value: object) -> bool:
+    """Text, a number, a pair of numbers, or a box of two such pairs."""
+    if isinstance(value, tuple):
+        return len(value) == 2 and all(isinstance(x, np.ndarray) and x.shape == (2,) for x in value)
+    return isinstance(value, str | int | float) or (isinstance(value, np.ndarray) and value.shape == (2,))
+
+
 def write_exr(
     path: str | os.PathLike,
     image: Num[np.ndarray, "h w c"] | Mapping[str, Num[np.ndarray, "h w c"]],
     *,
     half: bool = False,
+    attributes: Mapping[str, Any] | None = None,
 ) -> None:
     """Writes an image, or layers by name, losslessly compressed (ZIP); `read_exr_layers` gives them back.
 
     Floating point is stored as float32, or as float16 with `half`; integers as uint32. A layer of one
     channel takes the layer's name; two are named X, Y, three and four R, G, B, A, more are numbered.
 
+    Args:
+      attributes: for the header, as `exr_attributes` gives them.
     Raises:
       ValueError: if an array is not (h, w, c), the sizes differ, or two layers need the same channel name.
       OSError: if the file cannot be written.
@@ -135,7 +166,7 @@ def write_exr(
             if name in channels:
                 raise ValueError(f"layer {layer!r}: expected a new channel name, got {name!r} again")
             channels[name] = np.ascontiguousarray(pixels[..., index])
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {**(attributes or {}), "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary:
         with _quiet() as said:
             try:
