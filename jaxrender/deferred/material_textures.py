@@ -39,6 +39,12 @@ class MaterialTextures:
     packed: Textures
     slots: tuple[str, ...] = field(metadata={"static": True})
 
+    def apart(self, found: Float[Array, "*b c"]) -> dict[str, Float[Array, "*b 4"]]:
+        """What was looked up in `packed`, by slot, channels at their places and 1 where a slot has none."""
+        ends = np.cumsum([len(_CHANNELS[slot]) for slot in self.slots])
+        parts = zip(self.slots, jnp.split(found, ends[:-1], axis=-1), strict=True)
+        return {slot: _rgba(slot, part) for slot, part in parts}
+
 
 def material_slots(material: Material) -> tuple[str, ...]:
     """The fields of a material that name a texture anywhere. Not for use inside `jit`."""
@@ -82,13 +88,12 @@ def look_up_material(
     found = sample_texture_grad(
         textures.packed, gbuffer.uv, gbuffer.duv_dx, gbuffer.duv_dy, layer=own, max_anisotropy=max_anisotropy
     )
-    ends = np.cumsum([len(_CHANNELS[slot]) for slot in textures.slots])
-    parts = dict(zip(textures.slots, jnp.split(found, ends[:-1], axis=-1), strict=True))
-    texels = {slot: _rgba(slot, parts[slot]) for slot in parts if slot in slots and slot in TEXTURE_SLOTS}
+    parts = textures.apart(found)
+    texels = {slot: parts[slot] for slot in parts if slot in slots and slot in TEXTURE_SLOTS}
     surface = surface_of_texels(gbuffer, material, texels)
     if tangent is None or NORMAL not in slots:
         return surface, gbuffer.normal
-    return surface, turned_normal(gbuffer, tangent, material, parts[NORMAL])
+    return surface, turned_normal(gbuffer, tangent, material, parts[NORMAL][..., :3])
 
 
 def _rgba(slot: str, values: Float[Array, "*b c"]) -> Float[Array, "*b 4"]:

@@ -46,29 +46,45 @@ class EmbreeScene:
         # Embree builds its hierarchy lazily at the first query, which is not safe from several threads.
         self.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), "OCCLUDED")
 
-    def run(self, origins: np.ndarray, directions: np.ndarray, query: str, *, full: bool = False):
-        """One embreex call on the calling thread; C-contiguous float32 (n, 3) in."""
-        return self._scene.run(origins, directions, query=query, output=True if full else None)
+    def run(
+        self, origins: np.ndarray, directions: np.ndarray, query: str, *, full: bool = False,
+        max_distance: np.ndarray | None = None,
+    ):  # fmt: skip
+        """One embreex call on the calling thread; C-contiguous float32 (n, 3) in, (n,) for the distance."""
+        return self._scene.run(origins, directions, max_distance, query=query, output=True if full else None)
 
     def any_hit(
-        self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
+        self,
+        origins: Float[np.ndarray, "n 3"],
+        directions: Float[np.ndarray, "n 3"],
+        *,
+        max_distance: Float[np.ndarray, " n"] | None = None,
     ) -> Bool[np.ndarray, " n"]:
-        """True where the ray meets the mesh anywhere in front of its origin."""
+        """True where the ray meets the mesh anywhere in front of its origin, nearer than `max_distance`."""
         hit = np.empty(len(origins), bool)
 
         def piece(span: slice) -> None:
-            hit[span] = self.run(origins[span], directions[span], "OCCLUDED") == 0
+            # Embree writes into the distances.
+            reach = None if max_distance is None else np.array(max_distance[span], np.float32)
+            hit[span] = self.run(origins[span], directions[span], "OCCLUDED", max_distance=reach) == 0
 
         _run_pieces(piece, len(origins))
         return hit
 
-    def closest_hit(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Hits:
-        """The first face along each ray. Directions are unit, so that t is a distance."""
+    def closest_hit(
+        self,
+        origins: Float[np.ndarray, "n 3"],
+        directions: Float[np.ndarray, "n 3"],
+        *,
+        max_distance: Float[np.ndarray, " n"] | None = None,
+    ) -> Hits:
+        """The first face along each ray, nearer than `max_distance`. Directions are unit, so that t is a distance."""
         n = len(origins)
         hits = Hits(np.empty(n, np.int32), np.empty(n, np.float32), np.empty((n, 2), np.float32))
 
         def piece(span: slice) -> None:
-            found = self.run(origins[span], directions[span], "INTERSECT", full=True)
+            reach = None if max_distance is None else np.array(max_distance[span], np.float32)
+            found = self.run(origins[span], directions[span], "INTERSECT", full=True, max_distance=reach)
             hits.triangle[span] = found["primID"]
             hits.t[span] = found["tfar"]
             hits.barycentrics[span] = np.stack([found["u"], found["v"]], axis=-1)

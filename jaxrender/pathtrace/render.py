@@ -1,0 +1,166 @@
+"""Scene and camera -> light of guide rays, filtered, looked up for all eye rays: the picture.
+
+The steps are those of Bauszat, Eisemann, Magnor, "Guided Image Filtering for Interactive High-quality Global
+Illumination", 2011, section 3, with an answer to soft shadows added (`shadow_ratio`). They run on the host, block by
+block of pixels, as many at once as there are cores. The same seed gives the same picture.
+"""
+
+import functools
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from jaxrender.camera import Camera
+from jaxrender.filters.aovs import Aovs
+from jaxrender.filters.denoiser import DenoiseSettings, denoise
+from jaxrender.machine import on_all_cores
+from jaxrender.pathtrace import programs
+from jaxrender.pathtrace.emitters import only
+from jaxrender.pathtrace.guide_rays import SHARP, SOFT, Traced, joined, trace_guides
+from jaxrender.pathtrace.paths import Vertex
+from jaxrender.pathtrace.programs import BLOCK, light_up, make_view, rows, unshadowed_light
+from jaxrender.pathtrace.settings import TraceSettings
+from jaxrender.pathtrace.shadow_ratio import UNSHADOWED, filtered_ratio
+from jaxrender.pathtrace.world import World, prepare
+from jaxrender.scene import Scene
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A picture and its parts.
+
+    Attributes:
+      image: direct + indirect + emission, the mean over all eye rays.
+      incident: filtered indirect light of guide rays, over the reflectance.
+      guides: what it was made of. chosen: the filter's settings.
+    """
+
+    image: Float[np.ndarray, "h w 3"]
+    direct: Float[np.ndarray, "h w 3"]
+    indirect: Float[np.ndarray, "h w 3"]
+    emission: Float[np.ndarray, "h w 3"]
+    incident: Float[np.ndarray, "h w 3"]
+    guides: Traced
+    chosen: dict[str, float | int | str] = field(default_factory=dict)
+
+
+def render(
+    scene: Scene | World, camera: Camera, *, height: int, width: int, settings: TraceSettings | None = None
+) -> Rendered:
+    """Traces, filters, and puts together. Not for use inside `jit`.
+
+    Args:
+      scene: of `prepare` to use it for several pictures, or with lights that are not the scene's.
+    Raises:
+      ValueError: if a size or a setting is out of its range.
+    """
+    settings = settings or TraceSettings()
+    world = scene if isinstance(scene, World) else prepare(scene)
+    guides = trace_guides(world, camera, height=height, width=width, settings=settings)
+    incident, chosen = filter_incident(guides, settings)
+    return combine(world, camera, guides, incident, settings=settings, chosen=chosen)
+
+
+def render_direct(
+    scene: Scene | World, camera: Camera, *, height: int, width: int, settings: TraceSettings | None = None
+) -> Float[np.ndarray, "h w 3"]:
+    """The direct light of guide rays, unfiltered, with the reflectance in it."""
+    settings = settings or TraceSettings()
+    world = scene if isinstance(scene, World) else prepare(scene)
+    return trace_guides(world, camera, height=height, width=width, settings=settings).direct
+
+
+def render_indirect(
+    scene: Scene | World, camera: Camera, *, height: int, width: int, settings: TraceSettings | None = None
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3"]]:
+    """The indirect light that arrives where guide rays end, unfiltered, over the reflectance; and the reflectance."""
+    settings = settings or TraceSettings()
+    world = scene if isinstance(scene, World) else prepare(scene)
+    guides = trace_guides(world, camera, height=height, width=width, settings=settings)
+    return guides.incident, guides.albedo
+
+
+def filter_incident(guides: Traced, settings: TraceSettings) -> tuple[np.ndarray, dict[str, float | int | str]]:
+    """The indirect light of guide rays, filtered by normals, depths and ambient occlusion; and the settings."""
+    if settings.method == "none" or settings.bounces == 0:
+        return guides.incident, {"method": "none"}
+    aovs = Aovs(
+        guides.incident, direct=np.zeros_like(guides.incident), indirect=guides.incident, normal=guides.normal,
+        depth=guides.depth, ao=guides.ao,
+    )  # fmt: skip
+    chosen = DenoiseSettings(
+        method=settings.method, radius=settings.radius, eps=settings.eps,  # type: ignore[arg-type]
+        samples_per_pixel=settings.samples_per_pixel,
+    )  # fmt: skip
+    found = denoise(aovs, chosen)
+    return found.layers["indirect"], found.chosen
+
+
+def combine(
+    world: World, camera: Camera, guides: Traced, incident: Float[np.ndarray, "h w 3"], *, settings: TraceSettings,
+    chosen: dict[str, float | int | str] | None = None,
+) -> Rendered:  # fmt: skip
+    """All eye rays: each has its own surface and direct light, and the filtered light of the guide ray most like it."""
+    height, width = guides.incident.shape[:2]
+    spp = settings.samples_per_pixel
+    looked_up = [incident]
+    if settings.by_ratio:
+        looked_up += [_ratio(guides, settings), guides.met / np.maximum(guides.albedo, 1e-3)]
+    images = jnp.asarray(np.concatenate(looked_up, axis=-1)), jnp.asarray(guides.normal), jnp.asarray(guides.depth)
+    trace = functools.partial(_block, world, camera, guides, images, height=height, width=width, settings=settings)
+    blocks = list(on_all_cores(trace, range(0, height * width, BLOCK)))
+    parts = {name: image / spp for name, image in joined(blocks, height=height, width=width).items()}
+    image = sum(parts.values(), np.zeros_like(incident))
+    return Rendered(image, **parts, incident=incident, guides=guides, chosen=chosen or {})
+
+
+def _ratio(guides: Traced, settings: TraceSettings) -> np.ndarray:
+    over = np.maximum(guides.albedo, 1e-3)
+    return filtered_ratio(
+        guides.arrived / over, guides.unshadowed / over, normal=guides.normal, depth=guides.depth, ao=guides.ao,
+        shadow_rays=settings.shadow_rays,
+    )  # fmt: skip
+
+
+def _block(
+    world: World, camera: Camera, guides: Traced, images: tuple[Array, Array, Array], start: int, *, height: int,
+    width: int, settings: TraceSettings,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """Sums over eye rays, for `BLOCK` pixels."""
+    view, spp, model = make_view(camera, height=height), settings.samples_per_pixel, settings.model
+    soft, hard = only(world.emitters, SOFT), only(world.emitters, SHARP)
+    own = {name: _cut(getattr(guides, name), start) for name in ("arrived", "sharp", "met", "emission", "albedo")}
+    sums = {name: np.zeros((BLOCK, 3), np.float32) for name in ("direct", "indirect", "emission")}
+    vertex = Vertex(0, settings.light_samples, spp if settings.bounces else 0, model)
+    for sample in range(spp):
+        if sample == 0 and not (settings.by_ratio and soft.groups):
+            # All is known of guide rays already.
+            sums["direct"] += own["arrived"] + own["sharp"] + own["met"]
+            sums["emission"] += own["emission"]
+            sums["indirect"] += own["albedo"] * _cut(np.asarray(images[0][..., :3]), start)
+            continue
+        rays, seeds = programs.eye_rays(view, start, settings.seed, sample, height=height, width=width)
+        at, path, seen = programs.see(world, view, rays, model=model, by_ratio=settings.by_ratio)
+        found = np.asarray(programs.look_up_guides(*images, camera, seen, height=height, width=width))
+        sums["emission"] += seen["emission"]
+        sums["indirect"] += seen["albedo"] * found[:, :3]
+        if hard.groups:
+            sums["direct"] += light_up(world, hard, at, path, seeds, sample, vertex=vertex)[0]
+        if not soft.groups:
+            continue
+        if settings.by_ratio:
+            many = vertex._replace(drawn=max(1, UNSHADOWED // spp))
+            whole = rows(unshadowed_light(soft, world.table, at, path, seeds, np.int32(sample), vertex=many))
+            sums["direct"] += whole * found[:, 3:6] + seen["albedo"] * found[:, 6:9]
+        else:
+            sums["direct"] += light_up(world, soft, at, path, seeds, sample, vertex=vertex._replace(scattered=0))[0]
+    return sums
+
+
+def _cut(image: Float[np.ndarray, "h w c"], start: int) -> np.ndarray:
+    """`BLOCK` pixels from pixel `start` on; past the last, zeros."""
+    pixels = image.reshape(-1, image.shape[-1])[start : start + BLOCK]
+    return np.pad(pixels, [(0, BLOCK - len(pixels)), (0, 0)])

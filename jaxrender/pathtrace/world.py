@@ -1,0 +1,59 @@
+"""A scene made ready for paths: surfaces by triangle, lights, and rays."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxrender.deferred.pipeline import default_lights
+from jaxrender.pathtrace.emitters import Emitters, make_emitters
+from jaxrender.pathtrace.hit_points import SurfaceTable, surface_table
+from jaxrender.pathtrace.ray_scene import RayScene
+from jaxrender.scene import Lights, Scene, scene_bounds
+from jaxrender.sh_basis import basis_columns
+
+
+@dataclass(frozen=True)
+class World:
+    """A scene made ready for paths. Worth keeping between pictures."""
+
+    table: SurfaceTable
+    emitters: Emitters
+    rays: RayScene
+    extent: float
+    notes: tuple[str, ...] = ()
+
+
+def prepare(
+    scene: Scene, *, lights: Lights | None = None, environment: Float[np.ndarray, "h w 3"] | None = None
+) -> World:
+    """Builds what rays and paths need of a scene.
+
+    A scene without any light gets a sun and a sky, with a note that says so.
+
+    Raises:
+      ValueError: naming the field, if positions are not finite.
+    """
+    positions = np.asarray(scene.positions)
+    if not np.isfinite(positions[np.asarray(scene.faces)]).all():
+        raise ValueError("scene.positions: expected finite numbers, got NaN or Inf")
+    table = surface_table(scene)
+    emitters = make_emitters(scene, table, lights=lights, environment=environment)
+    notes: tuple[str, ...] = ()
+    if not emitters.groups:
+        sun, ambient = default_lights()
+        emitters = make_emitters(scene, table, lights=sun, environment=sky_image(ambient))
+        notes = ("no lights, a sun and a sky were added",)
+    low, high = (np.asarray(corner, np.float64) for corner in scene_bounds(scene))
+    return World(table, emitters, RayScene(scene, table), float(np.linalg.norm(high - low)) or 1.0, notes)
+
+
+def sky_image(ambient: Float[Array, "3 k"], *, height: int = 32) -> Float[np.ndarray, "h w 3"]:
+    """SH radiance as a latitude-longitude image, twice as wide as high; what is below 0 is 0."""
+    order = round(ambient.shape[1] ** 0.5)
+    theta = (np.arange(height) + 0.5) * (np.pi / height)
+    phi = (np.arange(2 * height) + 0.5) * (np.pi / height) - np.pi
+    s, c = np.sin(theta)[:, None], np.cos(theta)[:, None]
+    x, y, z = np.broadcast_arrays(s * np.sin(phi), c, -s * np.cos(phi))
+    basis = np.stack([np.asarray(b) for b in basis_columns(x, y, z, order=order)], axis=-1)
+    return np.maximum(basis @ np.asarray(ambient, np.float64).T, 0.0).astype(np.float32)
