@@ -84,14 +84,12 @@ class Relight:
 
 @dataclass(frozen=True)
 class SceneView:
-    """A scene, and how an image is taken of it: what the commands that rasterise are told."""
+    """A scene, and where it is seen from."""
 
     scene: tyro.conf.Positional[Path | None] = None
     """A glTF, GLB, PLY or OBJ file, or a scene.json. Without one, a built-in scene."""
     size: tuple[int, int] = (1024, 768)
     """Width and height in pixels."""
-    samples: int = 1
-    """Samples a pixel: 1, 2, 4, 8 or 16."""
     camera: int = 0
     """Which of the file's cameras; without any, the whole scene is framed."""
     eye: tuple[float, float, float] | None = None
@@ -111,14 +109,25 @@ class SceneView:
             raise ValueError("--target: expected another point than --eye")
         if min(self.size) < 1:
             raise ValueError(f"--size: expected two numbers of 1 or more, got {self.size[0]} {self.size[1]}")
-        check_one_of("--samples", self.samples, (1, 2, 4, 8, 16))
         check_at_least("--camera", self.camera, 0)
         if not 0.0 < self.fov_degrees < 180.0:
             raise ValueError(f"--fov-degrees: expected an angle between 0 and 180, got {self.fov_degrees}")
 
 
 @dataclass(frozen=True)
-class Render(SceneView):
+class SampledView(SceneView):
+    """What the commands that rasterise are told."""
+
+    samples: int = 1
+    """Samples a pixel: 1, 2, 4, 8 or 16."""
+
+    def check(self) -> None:
+        super().check()
+        check_one_of("--samples", self.samples, (1, 2, 4, 8, 16))
+
+
+@dataclass(frozen=True)
+class Render(SampledView):
     """Renders a scene by rasterisation and deferred shading: a PNG, and with --exr the G-buffer as layers."""
 
     out: Out = Path("out/render.png")
@@ -177,7 +186,7 @@ class Render(SceneView):
 
 
 @dataclass(frozen=True)
-class Quads(SceneView):
+class Quads(SampledView):
     """Shows what shading in 2x2 quads costs for a scene: helper lanes, overdraw, warps, lockstep, in numbers and maps.
 
     All quads are those of a forward renderer without a depth test; the visible ones are left after a perfect early
@@ -195,6 +204,79 @@ class Quads(SceneView):
         self.check()
         console.enable_compilation_cache()
         run_quads(self)
+
+
+@dataclass(frozen=True)
+class Trace(SceneView):
+    """Path-traces a scene: direct and indirect light apart, the indirect filtered by what the surfaces look like.
+
+    Writes the picture as PNG; with --exr also as EXR with its parts, and beside it the unfiltered light with all the
+    layers that `jaxrender denoise` wants. A scene without lights gets a sun and a sky.
+    """
+
+    out: Out = Path("out/trace.png")
+    """The picture; with --frames each has its number before the ending."""
+    spp: int = 4
+    """Samples a pixel: eye rays, and paths of indirect light."""
+    bounces: int = 2
+    """Bounces of indirect light; 0 leaves direct light alone."""
+    light_samples: int = 1
+    """Shadow rays of each eye ray to lamps, and to the sky."""
+    filter: Literal["guided", "bilateral", "atrous", "none"] = "guided"
+    """What cleans the indirect light."""
+    radius: int | None = None
+    """Of the filter, in pixels. By default a rule in samples and resolution."""
+    eps: float | None = None
+    """Of the filter: factor on what tells edges from noise. By default a rule."""
+    direct: Literal["auto", "ratio", "plain"] = "auto"
+    """Soft shadows: unshadowed light times a filtered ratio, or plain samples. By default the ratio up to 31 rays."""
+    model: Literal["metallic_roughness", "phong", "lambert"] = "metallic_roughness"
+    """How surfaces reflect."""
+    environment: Path | None = None
+    """A lat-long .hdr or .exr map that lights the scene, beside the lights of the file."""
+    time: float | None = None
+    """Instead of --spp: seconds; the picture is written again each time its samples have doubled."""
+    frames: int = 1
+    """Number of frames; more than one wants --orbit-degrees."""
+    orbit_degrees: float = 0.0
+    """How far the camera goes round what it looks at, over all frames."""
+    seed: int = 0
+    """Of all random numbers: the same for all frames, as still noise disturbs less."""
+    new_seeds: bool = False
+    """Another seed for each frame."""
+    exposure_stops: float = 0.0
+    """Brightens the PNG by powers of two."""
+    exr: bool = False
+    """Also write linear light and layers as OpenEXR files."""
+    json: bool = False
+    """Print one JSON object instead of the list of files."""
+
+    def run(self) -> None:
+        self.check()
+        from jaxrender.trace_command import run_trace
+
+        console.enable_compilation_cache()
+        run_trace(self)
+
+    def check(self) -> None:
+        super().check()
+        for name, value, low in (("spp", self.spp, 1), ("bounces", self.bounces, 0), ("frames", self.frames, 1),
+                                 ("light-samples", self.light_samples, 1), ("radius", self.radius, 1)):  # fmt: skip
+            if value is not None:
+                check_at_least(f"--{name}", value, low)
+        for name, number in (("time", self.time), ("eps", self.eps)):
+            if number is not None and not 0.0 < number < math.inf:
+                raise ValueError(f"--{name}: expected a finite number above 0, got {number}")
+        if self.bounces > 64:
+            raise ValueError(f"--bounces: expected at most 64, got {self.bounces}")
+        if self.time is not None and self.frames > 1:
+            raise ValueError("--time: expected it without --frames")
+        if not math.isfinite(self.orbit_degrees) or (self.frames > 1 and not self.orbit_degrees):
+            raise ValueError(
+                f"--orbit-degrees: expected a number that is not 0 with --frames, got {self.orbit_degrees}"
+            )
+        if not -64.0 <= self.exposure_stops <= 64.0:
+            raise ValueError(f"--exposure-stops: expected a number from -64 to 64, got {self.exposure_stops}")
 
 
 @dataclass(frozen=True)
@@ -312,7 +394,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"jaxrender {doctor.package_version('jaxrender')}")
         return 0
     description = "Real-time rendering methods as pure tensor kernels."
-    commands = Demo | Render | Denoise | Quads | Relight | Doctor
+    commands = Demo | Render | Trace | Denoise | Quads | Relight | Doctor
     return console.run_command(
         lambda: console.parse(commands, prog="jaxrender", description=description, argv=argv).run()
     )

@@ -1,5 +1,6 @@
 """The rays through pixel centres: their surface, the direct light on it, and the indirect light that arrives there."""
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ from jaxrender import checks
 from jaxrender.camera import Camera
 from jaxrender.machine import on_all_cores
 from jaxrender.pathtrace import programs
-from jaxrender.pathtrace.emitters import only
+from jaxrender.pathtrace.emitters import Emitters, only
 from jaxrender.pathtrace.paths import Path, Vertex
 from jaxrender.pathtrace.programs import BLOCK, View, light_up, make_view, rows
 from jaxrender.pathtrace.scatter import Reflector
@@ -30,9 +31,10 @@ class Traced:
     """Images of guide rays, before any filter. All are 0 where nothing is seen, but `emission`.
 
     Attributes:
-      arrived: light of lamps with extent and of the surroundings; unshadowed: what would arrive without anything in
-        between, of the same samples. sharp: light of lights without extent. met: of lamps that scattered rays met by
-        themselves. All four with the reflectance in them; arrived + sharp + met is the direct light.
+      arrived: light of lamps with extent, then of the surroundings, as far as there are any, side by side.
+      unshadowed: what would arrive without anything in between, of the same samples.
+      sharp: light of lights without extent. met: of what scattered rays met by themselves. These four have the
+        reflectance in them; the sum of all but `unshadowed` is the direct light.
       incident: indirect light over the reflectance.
       emission: of what is seen itself.
       variance: of `incident`, of the mean over paths; 0 for one path a pixel.
@@ -42,8 +44,8 @@ class Traced:
       ao: ambient occlusion for each of `AO_RADII`, 1 for open.
     """
 
-    arrived: Float[np.ndarray, "h w 3"]
-    unshadowed: Float[np.ndarray, "h w 3"]
+    arrived: Float[np.ndarray, "h w 3k"]
+    unshadowed: Float[np.ndarray, "h w 3k"]
     sharp: Float[np.ndarray, "h w 3"]
     met: Float[np.ndarray, "h w 3"]
     incident: Float[np.ndarray, "h w 3"]
@@ -59,7 +61,7 @@ class Traced:
 
     @property
     def direct(self) -> Float[np.ndarray, "h w 3"]:
-        return self.arrived + self.sharp + self.met
+        return sum_of_groups(self.arrived) + self.sharp + self.met
 
     @property
     def indirect(self) -> Float[np.ndarray, "h w 3"]:
@@ -70,9 +72,13 @@ class Traced:
         return self.direct + self.indirect + self.emission
 
 
-def trace_guides(world: World, camera: Camera, *, height: int, width: int, settings: TraceSettings) -> Traced:
+def trace_guides(
+    world: World, camera: Camera, *, height: int, width: int, settings: TraceSettings, first_sample: int = 0
+) -> Traced:
     """Direct and indirect light of the rays through pixel centres, unfiltered.
 
+    Args:
+      first_sample: number of the first of `samples_per_pixel` paths; others have other random numbers.
     Raises:
       ValueError: if a size or a setting is out of its range.
     """
@@ -80,9 +86,37 @@ def trace_guides(world: World, camera: Camera, *, height: int, width: int, setti
     checks.check_at_least("height", height, 1)
     checks.check_at_least("width", width, 1)
     view = make_view(camera, height=height)
-    trace = functools.partial(_block, world, view, height=height, width=width, settings=settings)
+    trace = functools.partial(
+        _block, world, view, height=height, width=width, settings=settings, first_sample=first_sample
+    )
     blocks = list(on_all_cores(trace, range(0, height * width, BLOCK)))
     return Traced(**joined(blocks, height=height, width=width))
+
+
+def pooled(first: Traced, second: Traced, *, counts: tuple[int, int]) -> Traced:
+    """The means over the paths of two traces of one view, which had so many each."""
+    n, m = counts
+    total = n + m
+    names = [field.name for field in dataclasses.fields(Traced)]
+    means = {name: (n * getattr(first, name) + m * getattr(second, name)) / total for name in names}
+    # Sums of squared deviations add up, with how far the two means are apart.
+    apart = first.incident - second.incident
+    squares = n * (n - 1) * first.variance + m * (m - 1) * second.variance + n * m / total * apart * apart
+    means["variance"] = squares / (total * (total - 1))
+    if n == m == 1:
+        means["even"], means["odd"] = first.incident, second.incident
+    same = ("emission", "albedo", "normal", "position", "depth")
+    return Traced(**means | {name: getattr(first, name) for name in same})
+
+
+def soft_groups(emitters: Emitters) -> list[Emitters]:
+    """The groups of light with extent, apart."""
+    return [only(emitters, (group,)) for group in SOFT if group in emitters.groups]
+
+
+def sum_of_groups(image: Float[np.ndarray, "*b 3k"]) -> Float[np.ndarray, "*b 3"]:
+    """The light of all groups that stand side by side."""
+    return image.reshape(*image.shape[:-1], -1, 3).sum(axis=-2)
 
 
 def joined(blocks: list[dict[str, np.ndarray]], *, height: int, width: int) -> dict[str, np.ndarray]:
@@ -94,7 +128,7 @@ def joined(blocks: list[dict[str, np.ndarray]], *, height: int, width: int) -> d
 
 
 def _block(
-    world: World, view: View, start: int, *, height: int, width: int, settings: TraceSettings
+    world: World, view: View, start: int, *, height: int, width: int, settings: TraceSettings, first_sample: int
 ) -> dict[str, np.ndarray]:
     """All images of `BLOCK` pixels, row by row, from pixel `start` on."""
     spp, model, by_ratio = settings.samples_per_pixel, settings.model, settings.by_ratio
@@ -105,21 +139,25 @@ def _block(
     sums = {name: np.zeros((BLOCK, 3), np.float32) for name in ("even", "odd", "squares", "met", "ao")}
     # Plain, each eye ray finds soft light for itself; by ratio, the guide ray finds it for all.
     shares = spp if by_ratio else 1
-    soft, hard = only(world.emitters, SOFT), only(world.emitters, SHARP)
-    arrived, unshadowed = np.zeros((2, BLOCK, 3), np.float32)
-    for sample in range(shares if soft.groups else 0):
-        for total, part in zip((arrived, unshadowed), light_up(world, soft, at, path, seeds, sample, vertex=vertex),
-                               strict=True):  # fmt: skip
-            total += part / shares
-    sharp = light_up(world, hard, at, path, seeds, 0, vertex=vertex)[0] if hard.groups else np.zeros_like(arrived)
+    soft, hard = soft_groups(world.emitters), only(world.emitters, SHARP)
+    arrived, unshadowed = np.zeros((2, BLOCK, 3 * len(soft)), np.float32)
+    for group, emitters in enumerate(soft):
+        own = slice(3 * group, 3 * group + 3)
+        for sample in range(first_sample, first_sample + shares):
+            seen, whole = light_up(world, emitters, at, path, seeds, sample, vertex=vertex)
+            arrived[:, own] += seen / shares
+            unshadowed[:, own] += whole / shares
+    sharp = np.zeros((BLOCK, 3), np.float32)
+    if hard.groups:
+        sharp = light_up(world, hard, at, path, seeds, first_sample, vertex=vertex)[0]
     radii = world.extent * np.asarray(AO_RADII, np.float32)
     for sample in range(scattered):
-        met, incident, ao = _follow(world, at, path, seeds, sample, radii, settings)
-        terms = {"odd" if sample % 2 else "even": incident, "squares": incident * incident, "met": met, "ao": ao}
-        for name, term in terms.items():
+        met, incident, ao = _follow(world, at, path, seeds, first_sample + sample, radii, settings)
+        half = "odd" if sample % 2 else "even"
+        for name, term in ((half, incident), ("squares", incident * incident), ("met", met), ("ao", ao)):
             sums[name] += term
     for ray in range(settings.num_ao_rays):
-        sums["ao"] += _occlusion(world, at, seeds, ray, radii)
+        sums["ao"] += _occlusion(world, at, seeds, first_sample + ray, radii)
     return {**images, "arrived": arrived, "unshadowed": unshadowed, "sharp": sharp, "met": sums["met"],
             **_means(sums, spp, num_ao=scattered + settings.num_ao_rays)}  # fmt: skip
 

@@ -19,11 +19,11 @@ from jaxrender.filters.denoiser import DenoiseSettings, denoise
 from jaxrender.machine import on_all_cores
 from jaxrender.pathtrace import programs
 from jaxrender.pathtrace.emitters import only
-from jaxrender.pathtrace.guide_rays import SHARP, SOFT, Traced, joined, trace_guides
+from jaxrender.pathtrace.guide_rays import SHARP, Traced, joined, soft_groups, sum_of_groups, trace_guides
 from jaxrender.pathtrace.paths import Vertex
 from jaxrender.pathtrace.programs import BLOCK, light_up, make_view, rows, unshadowed_light
 from jaxrender.pathtrace.settings import TraceSettings
-from jaxrender.pathtrace.shadow_ratio import UNSHADOWED, filtered_ratio
+from jaxrender.pathtrace.shadow_ratio import UNSHADOWED, filtered_ratio, ratio_radius
 from jaxrender.pathtrace.world import World, prepare
 from jaxrender.scene import Scene
 
@@ -108,7 +108,7 @@ def combine(
     spp = settings.samples_per_pixel
     looked_up = [incident]
     if settings.by_ratio:
-        looked_up += [_ratio(guides, settings), guides.met / np.maximum(guides.albedo, 1e-3)]
+        looked_up += [guides.met / np.maximum(guides.albedo, 1e-3), *_ratios(world, guides, settings)]
     images = jnp.asarray(np.concatenate(looked_up, axis=-1)), jnp.asarray(guides.normal), jnp.asarray(guides.depth)
     trace = functools.partial(_block, world, camera, guides, images, height=height, width=width, settings=settings)
     blocks = list(on_all_cores(trace, range(0, height * width, BLOCK)))
@@ -117,12 +117,17 @@ def combine(
     return Rendered(image, **parts, incident=incident, guides=guides, chosen=chosen or {})
 
 
-def _ratio(guides: Traced, settings: TraceSettings) -> np.ndarray:
+def _ratios(world: World, guides: Traced, settings: TraceSettings) -> list[np.ndarray]:
+    """The share of light that arrives, for each group of soft lights."""
     over = np.maximum(guides.albedo, 1e-3)
-    return filtered_ratio(
-        guides.arrived / over, guides.unshadowed / over, normal=guides.normal, depth=guides.depth, ao=guides.ao,
-        shadow_rays=settings.shadow_rays,
-    )  # fmt: skip
+    ratios = []
+    for k, emitters in enumerate(soft_groups(world.emitters)):
+        arrived, unshadowed = (x[..., 3 * k : 3 * k + 3] / over for x in (guides.arrived, guides.unshadowed))
+        radius = ratio_radius(settings.shadow_rays, group=emitters.groups[0])
+        ratios.append(
+            filtered_ratio(arrived, unshadowed, normal=guides.normal, depth=guides.depth, ao=guides.ao, radius=radius)
+        )
+    return ratios
 
 
 def _block(
@@ -131,14 +136,14 @@ def _block(
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """Sums over eye rays, for `BLOCK` pixels."""
     view, spp, model = make_view(camera, height=height), settings.samples_per_pixel, settings.model
-    soft, hard = only(world.emitters, SOFT), only(world.emitters, SHARP)
+    soft, hard = soft_groups(world.emitters), only(world.emitters, SHARP)
     own = {name: _cut(getattr(guides, name), start) for name in ("arrived", "sharp", "met", "emission", "albedo")}
     sums = {name: np.zeros((BLOCK, 3), np.float32) for name in ("direct", "indirect", "emission")}
     vertex = Vertex(0, settings.light_samples, spp if settings.bounces else 0, model)
     for sample in range(spp):
-        if sample == 0 and not (settings.by_ratio and soft.groups):
+        if sample == 0 and not (settings.by_ratio and soft):
             # All is known of guide rays already.
-            sums["direct"] += own["arrived"] + own["sharp"] + own["met"]
+            sums["direct"] += sum_of_groups(own["arrived"]) + own["sharp"] + own["met"]
             sums["emission"] += own["emission"]
             sums["indirect"] += own["albedo"] * _cut(np.asarray(images[0][..., :3]), start)
             continue
@@ -149,14 +154,16 @@ def _block(
         sums["indirect"] += seen["albedo"] * found[:, :3]
         if hard.groups:
             sums["direct"] += light_up(world, hard, at, path, seeds, sample, vertex=vertex)[0]
-        if not soft.groups:
-            continue
         if settings.by_ratio:
+            sums["direct"] += seen["albedo"] * found[:, 3:6]
+        for group, emitters in enumerate(soft):
+            if not settings.by_ratio:
+                plain = vertex._replace(scattered=0)
+                sums["direct"] += light_up(world, emitters, at, path, seeds, sample, vertex=plain)[0]
+                continue
             many = vertex._replace(drawn=max(1, UNSHADOWED // spp))
-            whole = rows(unshadowed_light(soft, world.table, at, path, seeds, np.int32(sample), vertex=many))
-            sums["direct"] += whole * found[:, 3:6] + seen["albedo"] * found[:, 6:9]
-        else:
-            sums["direct"] += light_up(world, soft, at, path, seeds, sample, vertex=vertex._replace(scattered=0))[0]
+            whole = rows(unshadowed_light(emitters, world.table, at, path, seeds, np.int32(sample), vertex=many))
+            sums["direct"] += whole * found[:, 6 + 3 * group : 9 + 3 * group]
     return sums
 
 

@@ -43,20 +43,26 @@ def shadow_ratio(
     return jnp.clip(jnp.where(some, seen / jnp.where(some, whole, 1.0), 1.0), 0.0, 1.0)
 
 
-def ratio_radius(shadow_rays: int) -> int:
-    """For so many rays a pixel: found on soft shadows of two scenes at 512 x 384 (3, 2, 1, 1 for 1, 2, 4, 16)."""
-    return max(1, round(3.0 * shadow_rays**-0.6))
+def ratio_radius(shadow_rays: int, *, group: str) -> int:
+    """In pixels, for so many rays a pixel: found on soft shadows of four scenes at 512 x 384.
+
+    Lamps cast shadows with borders, and the surroundings light like indirect light.
+
+    Args:
+      group: "area" (3, 2, 1, 1 pixels for 1, 2, 4, 16 rays) or "environment" (12, 8, 6, 3).
+    """
+    if group == "area":
+        return max(1, round(3.0 * shadow_rays**-0.6))
+    return max(1, round(12.0 * shadow_rays**-0.5))
 
 
 def filtered_ratio(
     arrived: Float[np.ndarray, "h w 3"], unshadowed: Float[np.ndarray, "h w 3"], *, normal: Float[np.ndarray, "h w 3"],
-    depth: Float[np.ndarray, "h w 1"], ao: Float[np.ndarray, "h w k"], shadow_rays: int,
+    depth: Float[np.ndarray, "h w 1"], ao: Float[np.ndarray, "h w k"], radius: int,
 ) -> Float[np.ndarray, "h w 3"]:  # fmt: skip
-    """`shadow_ratio` with normals, depths and ambient occlusion for guides, and the radius by its rule."""
+    """`shadow_ratio` with normals, depths and ambient occlusion for guides."""
     guides = make_guides(Aovs(arrived, normal=normal, depth=depth, ao=ao))
-    return np.asarray(
-        _ratio(arrived, unshadowed, guides.channels, jnp.asarray(guides.eps), radius=ratio_radius(shadow_rays))
-    )
+    return np.asarray(_ratio(arrived, unshadowed, guides.channels, jnp.asarray(guides.eps), radius=radius))
 
 
 _ratio = functools.partial(jax.jit, static_argnames="radius")(shadow_ratio)
