@@ -122,6 +122,7 @@ class SampledView(SceneView):
     """Samples a pixel: 1, 2, 4, 8 or 16."""
 
     def check(self) -> None:
+        """As `SceneView.check`."""
         super().check()
         check_one_of("--samples", self.samples, (1, 2, 4, 8, 16))
 
@@ -259,6 +260,7 @@ class Trace(SceneView):
         run_trace(self)
 
     def check(self) -> None:
+        """As `SceneView.check`."""
         super().check()
         for name, value, low in (("spp", self.spp, 1), ("bounces", self.bounces, 0), ("frames", self.frames, 1),
                                  ("light-samples", self.light_samples, 1), ("radius", self.radius, 1)):  # fmt: skip

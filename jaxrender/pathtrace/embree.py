@@ -4,27 +4,15 @@ NumPy in, NumPy out: ray casting is not differentiable and happens outside `jit`
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from jaxrender.checks import check_last_axis, check_same_shape
 from jaxrender.machine import num_cores
+from jaxrender.pathtrace.hits import Hits
 
 RAYS_PER_TASK = 1 << 17
-
-
-@dataclass(frozen=True)
-class Hits:
-    """Closest hits of n rays.
-
-    `triangle[i]` is the face index or -1; the other fields are meaningless where it is -1. The hit point is
-    (1 - u - v) a + u b + v c of the face's corners (a, b, c), at distance t along the (unit) ray.
-    """
-
-    triangle: Int[np.ndarray, " n"]
-    t: Float[np.ndarray, " n"]
-    barycentrics: Float[np.ndarray, "n 2"]
 
 
 class EmbreeScene:
@@ -47,26 +35,34 @@ class EmbreeScene:
         self.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), "OCCLUDED")
 
     def run(
-        self, origins: np.ndarray, directions: np.ndarray, query: str, *, full: bool = False,
+        self,
+        origins: np.ndarray,
+        directions: np.ndarray,
+        query: str,
+        *,
+        full: bool = False,
         max_distance: np.ndarray | None = None,
-    ):  # fmt: skip
-        """One embreex call on the calling thread; C-contiguous float32 (n, 3) in, (n,) for the distance."""
-        return self._scene.run(origins, directions, max_distance, query=query, output=True if full else None)
+    ):
+        """One embreex call on the calling thread; C-contiguous float32 (n, 3) in, and (n,) for max_distance.
+
+        Embree counts hits at t <= max_distance, and takes a ray with a negative one for a ray that has hit.
+        """
+        return self._scene.run(origins, directions, dists=max_distance, query=query, output=True if full else None)
 
     def any_hit(
         self,
         origins: Float[np.ndarray, "n 3"],
         directions: Float[np.ndarray, "n 3"],
         *,
-        max_distance: Float[np.ndarray, " n"] | None = None,
+        max_distance: Float[Array | np.ndarray, " n"] | None = None,
     ) -> Bool[np.ndarray, " n"]:
-        """True where the ray meets the mesh anywhere in front of its origin, nearer than `max_distance`."""
+        """Whether each ray meets the mesh with 0 <= t < max_distance."""
+        origins, directions, limit = _ready(origins, directions, max_distance)
         hit = np.empty(len(origins), bool)
 
         def piece(span: slice) -> None:
-            # Embree writes into the distances.
-            reach = None if max_distance is None else np.array(max_distance[span], np.float32)
-            hit[span] = self.run(origins[span], directions[span], "OCCLUDED", max_distance=reach) == 0
+            found = self.run(origins[span], directions[span], "OCCLUDED", max_distance=_up_to(limit, span))
+            hit[span] = (found == 0) & _may_hit(limit, span)
 
         _run_pieces(piece, len(origins))
         return hit
@@ -76,21 +72,46 @@ class EmbreeScene:
         origins: Float[np.ndarray, "n 3"],
         directions: Float[np.ndarray, "n 3"],
         *,
-        max_distance: Float[np.ndarray, " n"] | None = None,
+        max_distance: Float[Array | np.ndarray, " n"] | None = None,
     ) -> Hits:
-        """The first face along each ray, nearer than `max_distance`. Directions are unit, so that t is a distance."""
+        """The first face along each ray with 0 <= t < max_distance; t is in units of the direction's length."""
+        origins, directions, limit = _ready(origins, directions, max_distance)
         n = len(origins)
         hits = Hits(np.empty(n, np.int32), np.empty(n, np.float32), np.empty((n, 2), np.float32))
 
         def piece(span: slice) -> None:
-            reach = None if max_distance is None else np.array(max_distance[span], np.float32)
-            found = self.run(origins[span], directions[span], "INTERSECT", full=True, max_distance=reach)
-            hits.triangle[span] = found["primID"]
-            hits.t[span] = found["tfar"]
-            hits.barycentrics[span] = np.stack([found["u"], found["v"]], axis=-1)
+            found = self.run(origins[span], directions[span], "INTERSECT", full=True, max_distance=_up_to(limit, span))
+            hit = (found["primID"] >= 0) & _may_hit(limit, span)
+            hits.triangle[span] = np.where(hit, found["primID"], -1)
+            # Embree's t can be -0.
+            hits.t[span] = np.where(hit, np.maximum(found["tfar"], 0.0), np.inf)
+            hits.barycentrics[span] = np.where(hit[:, None], np.stack([found["u"], found["v"]], axis=-1), 0.0)
 
         _run_pieces(piece, n)
         return hits
+
+
+def _ready(origins, directions, max_distance) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """What embreex needs: C-contiguous float32 of the right shapes, which it does not check."""
+    origins, directions = (np.ascontiguousarray(x, np.float32) for x in (origins, directions))
+    check_last_axis("origins", origins, 3)
+    check_same_shape("origins and directions", origins, directions)
+    if max_distance is None:
+        return origins, directions, None
+    limit = np.ascontiguousarray(max_distance, np.float32)
+    check_same_shape("max_distance and origins without the last axis", limit, origins[:, 0])
+    return origins, directions, limit
+
+
+def _up_to(limit: np.ndarray | None, span: slice) -> np.ndarray | None:
+    """The largest t that counts; 0 for rays that can meet nothing."""
+    if limit is None:
+        return None
+    return np.where(limit[span] > 0, np.nextafter(limit[span], np.float32(0)), np.float32(0))
+
+
+def _may_hit(limit: np.ndarray | None, span: slice) -> np.ndarray | bool:
+    return True if limit is None else limit[span] > 0
 
 
 _pool: ThreadPoolExecutor | None = None

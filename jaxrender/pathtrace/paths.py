@@ -31,6 +31,7 @@ from jaxrender.pathtrace.emitters import (
 from jaxrender.pathtrace.environment import look_up
 from jaxrender.pathtrace.hit_points import HitSurface, SurfaceTable
 from jaxrender.pathtrace.low_discrepancy import Words, uniform_pair
+from jaxrender.pathtrace.ray_offset import moved_coordinates
 from jaxrender.pathtrace.scatter import Reflector, density, draw, evaluate
 from jaxrender.vec3 import Scalar, Vec3, dot
 
@@ -167,10 +168,9 @@ def go_on(at: Reflector, path: Path, seeds: Words, index: Int[Array, ""], *, ver
 
 
 def offset(at: Reflector, direction: Vec3) -> Vec3:
-    """Origins off the surface, on the side of a direction, by what rounding may move a point at these coordinates."""
-    p, n = at.position, at.geometric_normal
-    size = vec3.largest(Vec3(jnp.abs(p.x), jnp.abs(p.y), jnp.abs(p.z)))
-    return p + n * (jnp.where(dot(n, direction) >= 0.0, 1.0, -1.0) * (size * 4e-6 + 1e-7))
+    """Origins off the surface, on the side of a direction (`ray_offset.offset_origin`)."""
+    n = vec3.where(dot(at.geometric_normal, direction) < 0.0, -at.geometric_normal, at.geometric_normal)
+    return Vec3(*map(moved_coordinates, at.position, n))
 
 
 def openness(distance: Scalar, triangle: Int[Array, " n"], radii: Float[Array, " k"]) -> tuple[Scalar, ...]:

@@ -16,7 +16,6 @@ from jaxtyping import Array, Float
 from jaxrender import vec3
 from jaxrender.camera import Camera, look_at, project_px
 from jaxrender.pathtrace import paths
-from jaxrender.pathtrace.embree import Hits
 from jaxrender.pathtrace.emitters import Emitters
 from jaxrender.pathtrace.guide_lookup import guide_lookup
 from jaxrender.pathtrace.hit_points import (
@@ -27,6 +26,7 @@ from jaxrender.pathtrace.hit_points import (
     interpolate,
     look_up_texels,
 )
+from jaxrender.pathtrace.hits import Hits
 from jaxrender.pathtrace.low_discrepancy import pixel_seeds, uniform_pair
 from jaxrender.pathtrace.paths import Path, Rays, Vertex
 from jaxrender.pathtrace.scatter import Reflector, draw, make_reflector, reflectance

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxrender.pathtrace.embree import EmbreeScene, Hits
+from jaxrender.pathtrace.embree import EmbreeScene
 from jaxrender.pathtrace.hit_points import SurfaceTable, hit_surface
+from jaxrender.pathtrace.hits import Hits
 from jaxrender.scene import MASK, Scene
 from jaxrender.vec3 import Vec3
 

@@ -15,7 +15,8 @@ from jaxtyping import Float
 
 from jaxrender.camera import Camera
 from jaxrender.filters.aovs import Aovs
-from jaxrender.filters.denoiser import DenoiseSettings, denoise
+from jaxrender.filters.denoiser import denoise
+from jaxrender.filters.settings import DenoiseSettings
 from jaxrender.machine import on_all_cores
 from jaxrender.pathtrace import programs
 from jaxrender.pathtrace.emitters import only
@@ -95,7 +96,7 @@ def filter_incident(guides: Traced, settings: TraceSettings) -> tuple[np.ndarray
         method=settings.method, radius=settings.radius, eps=settings.eps,  # type: ignore[arg-type]
         samples_per_pixel=settings.samples_per_pixel,
     )  # fmt: skip
-    found = denoise(aovs, chosen)
+    found = denoise(aovs, settings=chosen)
     return found.layers["indirect"], found.chosen
 
 

@@ -7,31 +7,12 @@ import trimesh
 from jaxrender.pathtrace import embree
 from jaxrender.pathtrace.embree import EmbreeScene
 from tests.support import oracles
-
-
-def brute_force(vertices, faces, origins, directions):
-    """Face, distance and (u, v) of the first hit of each ray, in float64, triangle by triangle."""
-    best = np.full(len(origins), np.inf)
-    face, uv = np.full(len(origins), -1), np.zeros((len(origins), 2))
-    for index, (a, b, c) in enumerate(vertices[faces].astype(np.float64)):
-        # o + t d = a + u (b - a) + v (c - a), a 3x3 system per ray.
-        columns = np.stack(np.broadcast_arrays(-directions, b - a, c - a), axis=-1).astype(np.float64)
-        t, u, v = np.linalg.solve(columns, (origins - a).astype(np.float64)[..., None])[..., 0].T
-        nearer = (t > 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t < best)
-        best[nearer], face[nearer] = t[nearer], index
-        uv[nearer] = np.stack([u, v], axis=-1)[nearer]
-    return face, best, uv
+from tests.support.rays import brute_force, triangle_soup
 
 
 @pytest.fixture
 def soup(rng):
-    """60 triangles of size about 1 in a box of 4, and 500 rays through it."""
-    corners = rng.uniform(-2, 2, (60, 1, 3)) + rng.uniform(-0.6, 0.6, (60, 3, 3))
-    vertices = corners.reshape(-1, 3).astype(np.float32)
-    faces = np.arange(180, dtype=np.int32).reshape(-1, 3)
-    origins = rng.uniform(-3, 3, (500, 3)).astype(np.float32)
-    directions = oracles.unit(rng.uniform(-2, 2, (500, 3)) - origins).astype(np.float32)
-    return vertices, faces, origins, directions
+    return triangle_soup(rng)
 
 
 def test_closest_hit_is_that_of_a_loop_over_triangles(soup):
@@ -114,3 +95,25 @@ def test_a_hit_behind_the_origin_does_not_count():
     scene = EmbreeScene(vertices, np.array([[0, 1, 2]], np.int32))
     away = np.array([[0, 0, 1]], np.float32)
     assert not scene.any_hit(away, away).any()
+
+
+def test_hits_from_max_distance_on_do_not_count():
+    vertices = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], np.float32)
+    scene = EmbreeScene(vertices, np.array([[0, 1, 2]], np.int32))
+    limit = np.array([np.inf, 3, np.nextafter(np.float32(2), 3), 2, 1, 0, -1, np.nan], np.float32)
+    origins, directions = np.full((8, 3), [0, 0, 2], np.float32), np.full((8, 3), [0, 0, -1], np.float32)
+    expected = [True] * 3 + [False] * 5
+    np.testing.assert_array_equal(scene.any_hit(origins, directions, max_distance=limit), expected)
+    hits = scene.closest_hit(origins, directions, max_distance=limit)
+    np.testing.assert_array_equal(hits.triangle, np.where(expected, 0, -1))
+    np.testing.assert_array_equal(hits.t, np.where(expected, 2, np.inf))
+    np.testing.assert_array_equal(hits.barycentrics[3:], 0)
+
+
+def test_arrays_that_embree_would_read_past_are_refused(soup):
+    vertices, faces, origins, directions = soup
+    scene = EmbreeScene(vertices, faces)
+    with pytest.raises(ValueError, match="origins and directions: expected one shape"):
+        scene.any_hit(origins, directions[:5])
+    with pytest.raises(ValueError, match="max_distance and origins"):
+        scene.closest_hit(origins, directions, max_distance=np.ones(3))

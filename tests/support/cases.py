@@ -1422,12 +1422,49 @@ def _denoising() -> list[Case]:
     ]
 
 
+def _rays() -> list[Case]:
+    room, corners = "pathtrace", _normal(12, 3, 3)
+    # Half of them at points inside, and half past an edge.
+    inside = np.concatenate([_rng.dirichlet(np.ones(3), 6), [[-0.2, 0.6, 0.6]] * 2, [[0.6, -0.2, 0.6]] * 4])
+    origins = _normal(12, 3) + np.array([0.0, 0.0, 4.0])
+    directions = np.einsum("nk,nkj->nj", inside, corners) - origins
+    flat = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    lost = {
+        "corners": np.stack([flat, flat[[0, 1, 1]], flat]),
+        "origins": np.array([[0.2, 0.3, 2.0]] * 3),
+        "directions": np.array([[1.0, 2.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]),
+    }
+    axes = np.stack([np.cross(directions, _normal(12, 3)) for _ in range(2)], axis=-2)
+    leaving = {
+        "position": np.concatenate([_normal(6, 3), 1e4 * _normal(4, 3), 1e-2 * _normal(4, 3), np.zeros((1, 3))]),
+        "geometric_normal": _unit(15),
+        "direction": _normal(15, 3),
+    }
+    ray = {"origins": origins, "directions": directions}
+    return [
+        Case(
+            f"{room}.hit_parameters.hit_parameters",
+            {"corners": corners, **ray},
+            gradients=("corners", *ray),
+            ulps32=LONG_SUM,  # differences of positions, and faces met at grazing angles
+        ),
+        Case(f"{room}.hit_parameters.hit_parameters", lost, "nothing to hit"),
+        Case(f"{room}.ray_triangle.ray_plane_axes", {"directions": np.concatenate([_SPHERE, np.zeros((1, 3))])}),
+        Case(
+            f"{room}.ray_triangle.hit_distance",
+            {"corners": corners, **ray, "plane_axes": axes},
+            ulps32=LONG_SUM,  # the same
+        ),
+        Case(f"{room}.ray_offset.offset_origin", leaving, gradients=("position",)),
+    ]
+
+
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
         _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility,
         _pose_model, _skeleton, _skinning, _camera, _metrics, _scene, _texture, _quads, _warps, _brdf,
-        _whole_scene, _deferred_shading, _late, _box_filters, _guided_filter, _pair_filters, _denoising,
+        _whole_scene, _deferred_shading, _late, _box_filters, _guided_filter, _pair_filters, _denoising, _rays,
     )
     for case in room()
 )  # fmt: skip

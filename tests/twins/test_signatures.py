@@ -20,7 +20,8 @@ PAIRED = (
     "vecmath", "camera", "metrics", "scene", "brdf", "harmonics.", "animation.skeleton", "animation.skinning",
     "deferred.samples", "deferred.texture", "deferred.quads", "deferred.warps", "deferred.gbuffer", "deferred.shade",
     "deferred.late", "deferred.metrics", "deferred.sampling", "deferred.clusters", "deferred.fxaa", "deferred.mlaa",
-    "deferred.sraa", "deferred.highlights", "filters.",
+    "deferred.sraa", "deferred.highlights", "filters.", "pathtrace.hit_parameters", "pathtrace.ray_offset",
+    "pathtrace.ray_triangle",
 )  # fmt: skip
 UNPAIRED_MODULES = {
     "harmonics.pipeline": "the order of the stages, no arithmetic",
@@ -73,6 +74,7 @@ EXCEPTIONS = {
     "deferred.late.draw_late": "a driver: finds fragments and calls the shader; judged in tests/deferred",
     "harmonics.sh.triple_product_tensor": "torchref's way to the product",
     "harmonics.zh.zonal_integral": "torchref integrates where jaxrender has closed forms",
+    "pathtrace.ray_offset.moved_coordinates": "a step of offset_origin, which is compared as a whole",
     "filters.sat.mean_of": "against rounding, which torchref does not feel",
     "filters.guided.center_of": "the same",
     "filters.guided.filter_centered": "jaxrender's own way: pieces of an image",

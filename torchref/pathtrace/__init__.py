@@ -1,0 +1,1 @@
+"""The pointwise pieces of ray tracing."""
