@@ -4,12 +4,10 @@ A vector instruction then works on eight points at a time. With the components i
 and z of one, and sums over that axis would not be vectorised at all. Colors are kept the same way.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 Scalar = Float[Array, "*b"]
 
@@ -21,32 +19,32 @@ class Vec3(NamedTuple):
     y: Scalar
     z: Scalar
 
-    def __add__(self, other: Vec3 | Scalar | float) -> Vec3:  # type: ignore[override]
+    def __add__(self, other: "Vec3 | Scalar | float") -> "Vec3":  # type: ignore[override]
         o = _of(other)
         return Vec3(self.x + o.x, self.y + o.y, self.z + o.z)
 
-    def __sub__(self, other: Vec3 | Scalar | float) -> Vec3:
+    def __sub__(self, other: "Vec3 | Scalar | float") -> "Vec3":
         o = _of(other)
         return Vec3(self.x - o.x, self.y - o.y, self.z - o.z)
 
-    def __mul__(self, other: Vec3 | Scalar | float) -> Vec3:  # type: ignore[override]
+    def __mul__(self, other: "Vec3 | Scalar | float") -> "Vec3":  # type: ignore[override]
         o = _of(other)
         return Vec3(self.x * o.x, self.y * o.y, self.z * o.z)
 
-    def __truediv__(self, other: Vec3 | Scalar | float) -> Vec3:
+    def __truediv__(self, other: "Vec3 | Scalar | float") -> "Vec3":
         o = _of(other)
         return Vec3(self.x / o.x, self.y / o.y, self.z / o.z)
 
-    def __neg__(self) -> Vec3:
+    def __neg__(self) -> "Vec3":
         return Vec3(-self.x, -self.y, -self.z)
 
-    def __radd__(self, other: Scalar | float) -> Vec3:
+    def __radd__(self, other: Scalar | float) -> "Vec3":
         return self + other
 
-    def __rmul__(self, other: Scalar | float) -> Vec3:  # type: ignore[override]
+    def __rmul__(self, other: Scalar | float) -> "Vec3":  # type: ignore[override]
         return self * other
 
-    def __rsub__(self, other: Scalar | float) -> Vec3:
+    def __rsub__(self, other: Scalar | float) -> "Vec3":
         return -self + other
 
 
@@ -88,7 +86,7 @@ def normalize(v: Vec3) -> Vec3:
     return v * jnp.where(some, 1.0 / jnp.sqrt(jnp.where(some, squared, 1.0)), 0.0)
 
 
-def where(condition: Array, a: Vec3, b: Vec3 | float) -> Vec3:
+def where(condition: Bool[Array, "*b"], a: Vec3, b: Vec3 | float) -> Vec3:
     """a where the condition holds, b elsewhere."""
     o = _of(b)
     return Vec3(*(jnp.where(condition, p, q) for p, q in zip(a, o, strict=True)))

@@ -147,7 +147,7 @@ def gather_corners(table: SurfaceTable, triangle: Int[Array, " n"]) -> Float[Arr
 
 def interpolate(
     table: SurfaceTable, corners: Float[Array, "c n"], triangle: Int[Array, " n"], barycentrics: Float[Array, "n 2"],
-    direction: Vec3, width: Scalar | None = None,
+    direction: Vec3, width: Scalar | None,
 ) -> HitPoints:  # fmt: skip
     """Attributes at points of triangles, from `gather_corners`.
 
@@ -161,7 +161,7 @@ def interpolate(
     column = lambda k: jnp.where(some, corners[k] + b1 * corners[c + k] + b2 * corners[2 * c + k], 0.0)  # noqa: E731
     starts = dict(zip(table.attributes, np.cumsum([0, *(_WIDTH[name] for name in table.attributes)]), strict=False))
     read = lambda name, count, default: tuple(  # noqa: E731
-        column(starts[name] + k) if name in starts else jnp.full(some.shape, default) for k in range(count)
+        column(starts[name] + k) if name in starts else jnp.where(some, default, 0.0) for k in range(count)
     )
     flat = vec3.where(some, Vec3(*(corners[3 * c + k] for k in range(3))), 0.0)
     facing = dot(flat, direction)
@@ -215,6 +215,7 @@ def apply_material(table: SurfaceTable, points: HitPoints, texels: dict[str, Flo
     some = points.triangle >= 0
     texel = lambda slot, k: texels[slot][:, k] if slot in texels else jnp.ones_like(points.alpha)  # noqa: E731
     rgb = lambda slot: Vec3(*(texel(slot, k) for k in range(3)))  # noqa: E731
+    kept = lambda values: jnp.where(some, values, 0.0)  # noqa: E731
     factor = material.base_color[own]
     normal = points.normal
     if "normal_texture" in texels:
@@ -223,9 +224,9 @@ def apply_material(table: SurfaceTable, points: HitPoints, texels: dict[str, Flo
         triangle=points.triangle, position=points.position, normal=normal, geometric_normal=points.geometric_normal,
         front=points.front,
         base_color=vec3.where(some, vec3.from_array(factor) * rgb("base_color_texture") * points.color, 0.0),
-        alpha=factor[:, 3] * texel("base_color_texture", 3) * points.alpha,
-        metallic=material.metallic[own] * texel("metallic_roughness_texture", 2),
-        roughness=material.roughness[own] * texel("metallic_roughness_texture", 1),
+        alpha=kept(factor[:, 3] * texel("base_color_texture", 3) * points.alpha),
+        metallic=kept(material.metallic[own] * texel("metallic_roughness_texture", 2)),
+        roughness=kept(material.roughness[own] * texel("metallic_roughness_texture", 1)),
         emissive=vec3.where(some, vec3.from_array(material.emissive[own]) * rgb("emissive_texture"), 0.0),
     )  # fmt: skip
 
