@@ -8,6 +8,9 @@ from jaxrender.checks import check_last_axis, check_same_shape
 #: Differences below these shares of the range count as none: a wall's rounding must not decide.
 NORMAL_FLOOR, DEPTH_FLOOR = 1e-3, 1e-3
 
+#: Scores that differ by less are tied: 1 - d / max d is not exactly 0 where d is the largest.
+TIE = 1e-6
+
 
 def guide_lookup(
     image: Float[Array, "h w c"],
@@ -50,7 +53,8 @@ def guide_lookup(
     by_normal = _similarity(normal_distance, jnp.full_like(sample_depth, NORMAL_FLOOR))
     by_depth = _similarity(depth_distance, DEPTH_FLOOR * jnp.abs(sample_depth))
     seen = jnp.any(normals != 0.0, axis=-1)
-    away = jnp.sum((jnp.stack([column, row], axis=-1) + 0.5 - places_px[:, None, :]) ** 2, axis=-1)
+    centers = jnp.stack([column, row], axis=-1).astype(places_px.dtype) + 0.5
+    away = jnp.sum((centers - places_px[:, None, :]) ** 2, axis=-1)
     best = _first_of_largest(jnp.where(seen, by_normal * by_depth, -1.0), by_normal, -away)
     row, column = (jnp.take_along_axis(values, best[:, None], axis=1)[:, 0] for values in (row, column))
     return image[row, column], jnp.stack([row, column], axis=-1)
@@ -62,9 +66,9 @@ def _similarity(distance: Float[Array, "n 4"], floor: Float[Array, "n 1"]) -> Fl
 
 
 def _first_of_largest(*scores: Float[Array, "n 4"]) -> Int[Array, " n"]:
-    """The index with the largest first score; ties go by the next one."""
+    """The index with the largest first score; ties (within `TIE`) go by the next one."""
     tied = jnp.ones_like(scores[0], bool)
     for score in scores:
         among = jnp.where(tied, score, -jnp.inf)
-        tied = tied & (among == jnp.max(among, axis=1, keepdims=True))
+        tied = tied & (among >= jnp.max(among, axis=1, keepdims=True) - TIE)
     return jnp.argmax(tied, axis=1).astype(jnp.int32)
