@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxrender import vec3
 from jaxrender.deferred.shade import incoming
@@ -42,7 +42,7 @@ class Emitters:
     area_chance: Float[Array, " m"]
     area_corners: Float[Array, "m 12"]
     area_density: Float[Array, " t"]
-    two_sided: Array
+    two_sided: Bool[Array, " t"]
     lights: Lights
     light_chance: Float[Array, " n"]
     environment: Environment | None

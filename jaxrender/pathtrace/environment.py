@@ -92,9 +92,10 @@ def draw_direction(environment: Environment, u: Scalar, v: Scalar) -> FarLight:
     left = jnp.where(column > 0, environment.columns[row, jnp.maximum(column - 1, 0)], 0.0)
     du = jnp.clip((u - below) / jnp.maximum(environment.rows[row] - below, 1e-12), 0.0, 1.0)
     dv = jnp.clip((v - left) / jnp.maximum(environment.columns[row, column] - left, 1e-12), 0.0, 1.0)
-    top, bottom = (jnp.cos((row + i).astype(jnp.float32) * (math.pi / height)) for i in (0, 1))
+    top, bottom = (jnp.cos((row + i).astype(u.dtype) * (math.pi / height)) for i in (0, 1))
     y = top + (bottom - top) * du
-    radius, phi = jnp.sqrt(jnp.maximum(1.0 - y * y, 0.0)), (column + dv) * (2.0 * math.pi / width) - math.pi
+    phi = (column.astype(v.dtype) + dv) * (2.0 * math.pi / width) - math.pi
+    radius = jnp.sqrt(jnp.maximum(1.0 - y * y, 0.0))
     return _at(environment, Vec3(radius * jnp.sin(phi), y, -radius * jnp.cos(phi)), row, column)
 
 

@@ -55,7 +55,11 @@ def reverse_bits(x: Words) -> Words:
 
 
 def _permuted(x: Words, seed: Words) -> Words:
-    """Owen scrambling of reversed digits: every bit is flipped or not by a hash of those below it (Burley, sec. 3)."""
+    """Owen scrambling of reversed digits: every bit is flipped or not by a hash of those below it (Burley, sec. 3).
+
+    References:
+      Constants: Vegdahl, "Building a Better LK Hash", 2021.
+    """
     x = x ^ (x * jnp.uint32(0x3D20ADEA))
     x = (x + seed) * ((seed >> 16) | jnp.uint32(1))
     x = x ^ (x * jnp.uint32(0x05526C56))

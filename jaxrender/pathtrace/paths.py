@@ -127,7 +127,7 @@ def draw_lights(
     rays = []
     for s in range(vertex.drawn):
         dimension = vertex.number * _PAIRS
-        numbers = [uniform_pair(index * vertex.drawn + s, seeds, dimension=dimension + k) for k in range(_PAIRS)]
+        numbers = [_pair(at, index * vertex.drawn + s, seeds, dimension + k) for k in range(_PAIRS)]
         # Between them, the picks of a vertex fall into each of as many parts once.
         pick, pick_light = ((p + s) / vertex.drawn for p in numbers[_PICKS])
         for group in emitters.groups:
@@ -139,6 +139,11 @@ def draw_lights(
                 light = draw_environment(emitters, *numbers[_SKY])
             rays.append(_toward(at, path, light, vertex))
     return tuple(rays)
+
+
+def _pair(at: Reflector, index: Int[Array, ""], seeds: Words, dimension: int) -> tuple[Scalar, ...]:
+    """`uniform_pair` in the precision of the vertices."""
+    return tuple(x.astype(at.roughness.dtype) for x in uniform_pair(index, seeds, dimension=dimension))
 
 
 def _toward(at: Reflector, path: Path, light: Arriving, vertex: Vertex) -> ShadowRays:
@@ -154,9 +159,7 @@ def _toward(at: Reflector, path: Path, light: Arriving, vertex: Vertex) -> Shado
 
 def go_on(at: Reflector, path: Path, seeds: Words, index: Int[Array, ""], *, vertex: Vertex) -> tuple[Rays, Path]:
     """A scattered ray for each path; from `ROULETTE_FROM` on some end, and the others count for more."""
-    (u, v), (choice, luck) = (
-        uniform_pair(index, seeds, dimension=vertex.number * _PAIRS + k) for k in (_DIRECTION, _CHOICES)
-    )
+    (u, v), (choice, luck) = (_pair(at, index, seeds, vertex.number * _PAIRS + k) for k in (_DIRECTION, _CHOICES))
     scattered = draw(at, u, v, choice, model=vertex.model)
     throughput = path.throughput * scattered.weight
     alive = path.alive & (vec3.largest(throughput) > 0.0)
