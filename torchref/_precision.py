@@ -38,8 +38,8 @@ def in_float64(kernel: Kernel) -> Kernel:
 def _tensors(value: Any) -> list[torch.Tensor]:
     if is_dataclass(value) and not isinstance(value, type):
         return [t for f in fields(value) for t in _tensors(getattr(value, f.name))]
-    if isinstance(value, tuple):
-        return [t for x in value for t in _tensors(x)]
+    if isinstance(value, (tuple, dict)):
+        return [t for x in (value.values() if isinstance(value, dict) else value) for t in _tensors(x)]
     return [value] if isinstance(value, torch.Tensor) else []
 
 
@@ -47,7 +47,10 @@ def _cast(value: Any, dtype: torch.dtype) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return replace(value, **{f.name: _cast(getattr(value, f.name), dtype) for f in fields(value)})
     if isinstance(value, tuple):
-        return tuple(_cast(x, dtype) for x in value)
+        items = (_cast(x, dtype) for x in value)
+        return type(value)(*items) if hasattr(value, "_fields") else tuple(items)
+    if isinstance(value, dict):
+        return {name: _cast(x, dtype) for name, x in value.items()}
     if isinstance(value, torch.Tensor) and value.is_complex():
         return value.to(dtype.to_complex())
     if isinstance(value, torch.Tensor) and value.is_floating_point():

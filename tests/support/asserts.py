@@ -14,6 +14,9 @@ def flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     if is_dataclass(value) and not isinstance(value, type):
         for f in fields(value):
             yield from flatten(getattr(value, f.name), f"{path}.{f.name}")
+    elif hasattr(value, "_fields"):
+        for name in value._fields:
+            yield from flatten(getattr(value, name), f"{path}.{name}")
     elif isinstance(value, dict):
         for key, item in value.items():
             yield from flatten(item, f"{path}[{key!r}]")

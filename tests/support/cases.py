@@ -1459,12 +1459,397 @@ def _rays() -> list[Case]:
     ]
 
 
+def _vec(values: np.ndarray) -> Record:
+    """(..., 3) as three arrays."""
+    return Record("vec3.Vec3", {name: values[..., k].copy() for k, name in enumerate("xyz")})
+
+
+def _three_vectors() -> list[Case]:
+    a, b, n = _normal(6, 3), _normal(6, 3), _vec(_SPHERE)
+    a[2] = 0.0
+    both = {"a": _vec(a), "b": _vec(b)}
+    one = {"v": _vec(a)}
+    return [
+        Case("vec3.from_array", {"values": a}, gradients=("values",)),
+        Case("vec3.to_array", one, gradients=("v",)),
+        Case("vec3.dot", both, gradients=("a", "b")),
+        Case("vec3.cross", both, gradients=("a", "b")),
+        *(Case(f"vec3.{name}", one, gradients=("v",)) for name in ("length", "normalize", "mean")),
+        Case("vec3.largest", {"v": _vec(b)}, gradients=("v",)),
+        Case("vec3.where", {"condition": a[:, 0] > 0.0, **both}, gradients=("a", "b")),
+        Case("vec3.where", {"condition": a[:, 0] > 0.0, "a": both["a"], "b": 0.5}, "number", gradients=("a",)),
+        Case("vec3.reflect", {"v": _vec(_normal(len(_SPHERE), 3)), "n": n}, gradients=("v",)),
+        Case("vec3.tangents", {"n": n}),
+    ]
+
+
+def _words(*shape: int) -> np.ndarray:
+    return _rng.integers(0, 2**32, shape, dtype=np.uint32)
+
+
+def _sequences() -> list[Case]:
+    """Exact: the same integers, and the same float32 numbers made of them."""
+    room = "pathtrace.low_discrepancy"
+    x = np.concatenate([_words(50), np.array([0, 1, 2**31, 2**32 - 1], np.uint32)])
+    index = np.concatenate([np.arange(30), [1000, 12345, 2**31 - 1]]).astype(np.int32)
+    return [
+        Case(f"{room}.hash_words", {"x": x}),
+        Case(f"{room}.reverse_bits", {"x": x}),
+        Case(f"{room}.pixel_seeds", {"pixel": np.arange(40, dtype=np.int32), "seed": 7}),
+        *(
+            Case(
+                f"{room}.uniform_pair",
+                {"index": index, "seed": _words(len(index)), "dimension": d},
+                f"dimension {d}",
+                ulps64=0.0,
+                ulps32=0.0,
+            )
+            for d in (0, 3, 1001)
+        ),
+    ]
+
+
+def _environment_record(height: int = 4, width: int = 7) -> Record:
+    """With a black row, a black texel, and a texel that shines more than all others."""
+    image = _uniform(0.1, 1.0, height, width, 3)
+    image[1], image[0, 2], image[2, 3] = 0.0, 0.0, [30.0, 20.0, 10.0]
+    edges = np.cos(np.linspace(0.0, math.pi, height + 1))
+    solid = np.repeat(-np.diff(edges)[:, None] * 2.0 * math.pi / width, width, axis=1)
+    power = image.mean(-1) * solid
+    chance = power / power.sum()
+    inside = np.where(power.sum(1, keepdims=True) > 0.0, power, 1.0)
+    columns = np.cumsum(inside, axis=1) / inside.sum(1, keepdims=True)
+    fields = {"density": chance / solid, "rows": np.cumsum(chance.sum(1)), "columns": columns}
+    fields["rows"][-1], fields["columns"][:, -1] = 1.0, 1.0
+    return Record("pathtrace.environment.Environment", {"radiance": image, **fields})
+
+
+def _surroundings() -> list[Case]:
+    room = "pathtrace.environment"
+    environment = {"environment": _environment_record()}
+    directions = {"direction": _vec(_unit(40))}
+    image = _uniform(0.0, 2.0, 5, 6, 3).astype(np.float32)
+    image[2, 1:4] = 0.0
+    # The tables are float32 on both sides, whatever the rest is in.
+    single = {"host": True, "ulps64": ROUNDING * 2.0**29}
+    return [
+        Case(f"{room}.make_environment", {"image": image}, **single),
+        Case(f"{room}.make_environment", {"image": 0.0 * image}, "black", **single),
+        Case(f"{room}.texel_of", {**environment, **directions}),
+        Case(f"{room}.look_up", {**environment, **directions}),
+        Case(
+            f"{room}.draw_direction",
+            {**environment, "u": _uniform(0.0, 1.0, 40), "v": _uniform(0.0, 1.0, 40)},
+            ulps32=LONG_SUM,  # what is left of a number within a texel, over its chance
+        ),
+    ]
+
+
+def _lookups() -> list[Case]:
+    height, width, n = 5, 6, 60
+    normal, depth = _unit(height, width), _uniform(1.0, 3.0, height, width, 1)
+    normal[:2, :2], normal[4, 3:5] = normal[0, 0], 0.0
+    depth[:2, :2] = 2.0
+    guides = {"image": _normal(height, width, 4), "normal": normal, "depth": depth}
+    places = {
+        "places_px": _uniform(-0.5, 6.5, n, 2),
+        "sample_normal": np.concatenate([_unit(n // 2), np.tile(normal[0, 0], (n // 2, 1))]),
+        "sample_depth": np.concatenate([_uniform(1.0, 3.0, n // 2, 1), np.full((n // 2, 1), 2.0)]),
+    }
+    arrived = _uniform(0.0, 1.0, 7, 8, 3)
+    arrived[:3, :2] = 0.0
+    whole = arrived + _uniform(0.0, 0.5, 7, 8, 3)
+    whole[:3, :2] = 0.0
+    ratio = {"arrived": arrived, "unshadowed": whole, "channels": _uniform(0.0, 1.0, 7, 8, 2)}
+    eps = {"eps": np.array([0.02, 0.05])}
+    return [
+        Case("pathtrace.guide_lookup.guide_lookup", {**guides, **places}, gradients=("image",)),
+        *(
+            Case(
+                "pathtrace.shadow_ratio.shadow_ratio",
+                {**ratio, **eps, "radius": r},
+                f"radius {r}",
+                gradients=("arrived", "unshadowed"),
+                ulps32=LONG_SUM,  # differences of moments, and a quotient
+            )
+            for r in (0, 2)
+        ),
+        *(
+            Case("pathtrace.shadow_ratio.ratio_radius", {"shadow_rays": n}, f"{n} rays", host=True)
+            for n in (1, 2, 4, 16, 100)
+        ),
+    ]
+
+
+_MODELS = ("metallic_roughness", "phong", "lambert")
+
+
+def _bent(n: np.ndarray, amount: float) -> np.ndarray:
+    bent = n + amount * _normal(*n.shape)
+    return bent / np.linalg.norm(bent, axis=-1, keepdims=True)
+
+
+def _reflector_record(n: int) -> Record:
+    """Points seen from the front of their triangle, some of them from behind their bent normal."""
+    geometric = _unit(n)
+    wo = _unit(n)
+    wo *= np.sign((wo * geometric).sum(-1, keepdims=True))
+    metallic, base = np.arange(n)[:, None] % 3 / 2.0, _uniform(0.1, 1.0, n, 3)
+    fields = {
+        "position": _vec(_uniform(-1.0, 1.0, n, 3)),
+        "normal": _vec(_bent(geometric, 0.3)),
+        "geometric_normal": _vec(geometric),
+        "wo": _vec(wo),
+        "diffuse": _vec(base * (1.0 - metallic)),
+        "mirror": _vec(0.04 * (1.0 - metallic) + base * metallic),
+        "roughness": _uniform(0.35, 1.0, n),
+        "matt_share": np.where(metallic[:, 0] == 1.0, 0.0, _uniform(0.1, 0.9, n)),
+    }
+    return Record("pathtrace.scatter.Reflector", fields)
+
+
+def _hit_surface_record(n: int) -> Record:
+    geometric = _unit(n)
+    triangle = np.arange(n, dtype=np.int32) % 7 - 1
+    metallic = np.arange(n) % 3 / 2.0
+    some = (triangle >= 0)[:, None]
+    fields = {
+        "triangle": triangle,
+        "position": _vec(np.where(some, _uniform(-1.0, 1.0, n, 3), 0.0)),
+        "normal": _vec(np.where(some, _bent(geometric, 0.2), 0.0)),
+        "geometric_normal": _vec(np.where(some, geometric, 0.0)),
+        "front": np.arange(n) % 2 == 0,
+        "base_color": _vec(np.where(some, _uniform(0.1, 1.0, n, 3) * (np.arange(n) % 5 > 0)[:, None], 0.0)),
+        "alpha": np.where(some[:, 0], _uniform(0.0, 1.0, n), 0.0),
+        "metallic": metallic,
+        "roughness": _uniform(0.3, 1.0, n),
+        "emissive": _vec(np.where(some, _uniform(0.0, 2.0, n, 3), 0.0)),
+    }
+    return Record("pathtrace.hit_points.HitSurface", fields)
+
+
+def _scattering() -> list[Case]:
+    room, n = "pathtrace.scatter", 60
+    at = {"at": _reflector_record(n)}
+    wi = {"wi": _vec(_unit(n))}
+    numbers = {name: _uniform(0.0, 1.0, n) for name in ("u", "v", "choice")}
+    seen = {"surface": _hit_surface_record(n), "direction": _vec(_unit(n))}
+    cases = [Case(f"{room}.reflectance", at, gradients=("at",))]
+    for model in _MODELS:
+        option = {"model": model}
+        cases += [
+            Case(f"{room}.make_reflector", {**seen, **option}, model),
+            Case(f"{room}.evaluate", {**at, **wi, **option}, model, ulps32=LONG_SUM),  # powers of cosines
+            Case(f"{room}.density", {**at, **wi, **option}, model, ulps32=LONG_SUM),
+            Case(f"{room}.draw", {**at, **numbers, **option}, model, ulps32=16.0 * LONG_SUM),  # flanks of lobes
+        ]
+    return cases
+
+
+def _table_record(*names: str, slots: tuple[str, ...] = (), **changed: np.ndarray) -> Record:
+    """A `SurfaceTable` of the triangles of `scenes.scene`, from the definition of its columns."""
+    rng = np.random.default_rng(91)
+    scene, material, textures = scenes.scene(rng), scenes.material(rng), scenes.textures(rng)
+    columns = {"position": "positions", "normal": "normals", "uv": "uv", "color": "colors", "tangent": "tangents"}
+    values = np.concatenate([scene[columns[name]] for name in names], axis=1)
+    a, b, c = (values[scene["faces"][:, k]] for k in range(3))
+    p, q = scene["positions"][scene["faces"]], scene["uv"][scene["faces"]]
+    doubled = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    area = np.linalg.norm(doubled, axis=1, keepdims=True)
+    edge_1, edge_2 = q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
+    uv_area = np.abs(edge_1[:, :1] * edge_2[:, 1:] - edge_1[:, 1:] * edge_2[:, :1])
+    fields = {
+        "corners": np.concatenate([a, b - a, c - a, doubled / area, np.sqrt(uv_area / area)], axis=1),
+        "material_id": scene["material_id"],
+        "material": Record("scene.Material", material | changed),
+        "textures": Record("deferred.texture.Textures", textures) if slots else None,
+        "attributes": names,
+        "slots": slots,
+    }
+    return Record("pathtrace.hit_points.SurfaceTable", fields)
+
+
+_ALL_SLOTS = ("base_color_texture", "metallic_roughness_texture", "normal_texture", "emissive_texture")
+
+
+def _by_name(result: dict) -> dict:
+    return {name: result[name] for name in sorted(result)}
+
+
+def _barycentrics(n: int) -> np.ndarray:
+    corners = _rng.dirichlet([1.0, 1.0, 1.0], n)
+    return corners[:, 1:].copy()
+
+
+def _hit_points() -> list[Case]:
+    room, n = "pathtrace.hit_points", 40
+    whole = _table_record("position", "normal", "uv", "color", "tangent", slots=_ALL_SLOTS)
+    bare = _table_record("position", "normal")
+    triangle = np.arange(n, dtype=np.int32) % 27 - 1
+    hits = {"triangle": triangle, "barycentrics": _barycentrics(n), "direction": _vec(_unit(n))}
+    width = {"width": _uniform(0.001, 0.3, n)}
+    rows = {
+        name: table.fields["corners"][np.maximum(triangle, 0)].T.copy() for name, table in (("w", whole), ("b", bare))
+    }
+    points = {
+        "triangle": triangle,
+        "material_id": np.where(triangle >= 0, triangle % 4, 0).astype(np.int32),
+        **{name: _vec(_normal(n, 3)) for name in ("position",)},
+        **{name: _vec(_unit(n)) for name in ("normal", "geometric_normal", "tangent")},
+        "handedness": np.where(np.arange(n) % 2 == 0, 1.0, -1.0),
+        "front": np.arange(n) % 3 == 0,
+        "u": _normal(n),
+        "v": _normal(n),
+        "uv_width": _uniform(0.0, 0.3, n),
+        "color": _vec(_uniform(0.0, 1.0, n, 3)),
+        "alpha": _uniform(0.0, 1.0, n),
+    }
+    points = {"points": Record("pathtrace.hit_points.HitPoints", points)}
+    texels = {slot: _uniform(0.1, 1.0, n, 4) for slot in _ALL_SLOTS}
+    long = {"ulps32": LONG_SUM}  # of coordinates and of levels
+    return [
+        Case(f"{room}.gather_corners", {"table": whole, "triangle": triangle}, gradients=("table",)),
+        Case(
+            f"{room}.interpolate",
+            {"table": whole, "corners": rows["w"], **hits, **width},
+            gradients=("barycentrics", "corners", "width"),
+            **long,
+        ),
+        Case(
+            f"{room}.interpolate",
+            {"table": bare, "corners": rows["b"], **hits, "width": None},
+            "bare",
+            gradients=("barycentrics", "corners"),
+            **long,
+        ),
+        Case(f"{room}.look_up_texels", {"table": whole, **points, "fine": True}, "fine", outcome=_by_name, **long),
+        Case(f"{room}.look_up_texels", {"table": whole, **points, "fine": False}, outcome=_by_name, **long),
+        Case(f"{room}.look_up_texels", {"table": bare, **points, "fine": True}, "no textures"),
+        Case(f"{room}.apply_material", {"table": whole, **points, "texels": texels}, **long),
+        Case(f"{room}.apply_material", {"table": bare, **points, "texels": {}}, "no textures", **long),
+        Case(f"{room}.hit_surface", {"table": whole, **hits, **width}, ulps32=8.0 * LONG_SUM),  # texels per uv
+        Case(f"{room}.hit_surface", {"table": bare, **hits}, "no textures", **long),
+    ]
+
+
+def _emitters_record(*groups: str) -> Record:
+    """Eight of the triangles of `_table_record`, every second with two sides, and the lights of `scenes`."""
+    corners = _table_record("position", "normal").fields["corners"]
+    num, triangle = len(corners), np.arange(3, 19, 2, dtype=np.int32)
+    a, e1, e2 = (corners[triangle, 6 * k : 6 * k + 3] for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(e1, e2), axis=1)
+    emission = _uniform(0.5, 3.0, len(triangle), 3)
+    power = area * emission.mean(1)
+    chance, density = np.cumsum(power) / power.sum(), np.zeros(num)
+    chance[-1] = 1.0
+    density[triangle] = np.diff(chance, prepend=0.0) / area
+    lights = scenes.lights()
+    light_chance = np.cumsum([0.3, 0.2, 0.1, 0.3, 0.1])
+    light_chance[-1] = 1.0
+    fields = {
+        "area_triangle": triangle,
+        "area_chance": chance,
+        "area_corners": np.concatenate([a, e1, e2, emission], axis=1),
+        "area_density": density,
+        "two_sided": np.arange(num) % 4 == 1,
+        "lights": Record("scene.Lights", lights),
+        "light_chance": light_chance,
+        "environment": _environment_record(),
+        "groups": groups,
+    }
+    return Record("pathtrace.emitters.Emitters", fields)
+
+
+def _emitters() -> list[Case]:
+    room, n = "pathtrace.emitters", 50
+    emitters = {"emitters": _emitters_record("area", "lights", "environment")}
+    plain, textured = _table_record("position", "normal"), _table_record("position", "normal", "uv", slots=_ALL_SLOTS)
+    numbers = {name: _uniform(0.0, 1.0, n) for name in ("pick", "u", "v")}
+    position = {"position": _vec(_uniform(-2.0, 2.0, n, 3))}
+    triangle = np.arange(n, dtype=np.int32) % 27 - 1
+    met = {"triangle": triangle, "distance": _uniform(0.1, 3.0, n), "cosine": _uniform(-1.0, 1.0, n)}
+    drawn = {**emitters, **position, **numbers}
+    return [
+        Case(f"{room}.draw_area", {**drawn, "table": plain}, ulps32=LONG_SUM, gradients=("position",)),
+        Case(f"{room}.draw_area", {**drawn, "table": textured}, "textured", ulps32=8.0 * LONG_SUM),
+        Case(f"{room}.draw_light", {**emitters, **position, "pick": numbers["pick"]}, ulps32=LONG_SUM),
+        Case(f"{room}.draw_environment", {**emitters, "u": numbers["u"], "v": numbers["v"]}, ulps32=LONG_SUM),
+        Case(f"{room}.area_density", {**emitters, **met}, gradients=("distance", "cosine")),
+        Case(f"{room}.emitted", {**emitters, "surface": _hit_surface_record(n)}),
+        Case(f"{room}.only", {**emitters, "groups": ("lights", "area")}, outcome=_groups_alone),
+    ]
+
+
+def _groups_alone(emitters: Any) -> Any:
+    assert emitters.groups == ("area", "lights")
+    return emitters.area_chance
+
+
+def _path_record(n: int) -> Record:
+    fields = {
+        "throughput": _vec(_uniform(0.0, 0.8, n, 3)),
+        "density": _uniform(0.05, 2.0, n),
+        "alive": np.arange(n) % 9 > 0,
+        "shared": np.arange(n) % 4 > 0,
+    }
+    return Record("pathtrace.paths.Path", fields)
+
+
+def _vertex_record(number: int, drawn: int, scattered: int, model: str = "metallic_roughness") -> Record:
+    return Record("pathtrace.paths.Vertex", {"number": number, "drawn": drawn, "scattered": scattered, "model": model})
+
+
+def _paths() -> list[Case]:
+    room, n = "pathtrace.paths", 36
+    emitters = _emitters_record("area", "lights", "environment")
+    path, at = {"path": _path_record(n)}, {"at": _reflector_record(n)}
+    sequence = {"seeds": _words(n), "index": np.array(5, np.int32)}
+    ends = {"direction": _vec(_unit(n)), "distance": _uniform(0.5, 4.0, n), "surface": _hit_surface_record(n)}
+    table = {"table": _table_record("position", "normal")}
+    radii = np.array([0.5, 2.0])
+    # Numbers of 24 bits, which float32 divides and halves again, and densities of peaks.
+    long = {"ulps32": 16.0 * LONG_SUM}
+    return [
+        Case(f"{room}.begin", {"num_paths": 5}),
+        Case(f"{room}.meet", {"emitters": emitters, **path, **ends, "left": _vertex_record(1, 2, 1)}, **long),
+        *(
+            Case(
+                f"{room}.draw_lights",
+                {"emitters": emitters, **table, **at, **path, **sequence, "vertex": _vertex_record(*numbers)},
+                label,
+                **long,
+            )
+            for label, numbers in (
+                ("both ways", (1, 2, 1)),
+                ("drawn only", (0, 3, 0, "lambert")),
+                ("phong", (2, 1, 4, "phong")),
+            )
+        ),
+        *(
+            Case(
+                f"{room}.go_on",
+                {**at, **path, **sequence, "vertex": _vertex_record(number, 1, 1, model)},
+                model,
+                **long,
+            )
+            for number, model in zip((0, 2, 4), _MODELS, strict=True)
+        ),
+        Case(f"{room}.offset", {**at, "direction": _vec(_unit(n))}),
+        Case(
+            f"{room}.openness",
+            {"distance": _uniform(0.1, 3.0, n), "triangle": np.arange(n, dtype=np.int32) % 5 - 1, "radii": radii},
+            gradients=("distance",),
+        ),
+    ]
+
+
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
         _vecmath, _sh, _zh, _brdf_operator, _light, _zh_fit, _linear_model, _shading, _visibility,
         _pose_model, _skeleton, _skinning, _camera, _metrics, _scene, _texture, _quads, _warps, _brdf,
         _whole_scene, _deferred_shading, _late, _box_filters, _guided_filter, _pair_filters, _denoising, _rays,
+        _three_vectors, _sequences, _surroundings, _lookups, _scattering, _hit_points, _emitters, _paths,
     )
     for case in room()
 )  # fmt: skip

@@ -101,6 +101,8 @@ def _build(value: Any, package: str, array: Callable[[np.ndarray], Any]) -> Any:
         return public(package, value.name)(**fields)
     if isinstance(value, tuple):
         return tuple(_build(x, package, array) for x in value)
+    if isinstance(value, dict):
+        return {name: _build(x, package, array) for name, x in value.items()}
     return array(value) if isinstance(value, np.ndarray) else value
 
 
