@@ -1575,8 +1575,9 @@ def _lookups() -> list[Case]:
             for r in (0, 2)
         ),
         *(
-            Case("pathtrace.shadow_ratio.ratio_radius", {"shadow_rays": n}, f"{n} rays", host=True)
+            Case("pathtrace.shadow_ratio.ratio_radius", {"shadow_rays": n, "group": g}, f"{g}, {n} rays", host=True)
             for n in (1, 2, 4, 16, 100)
+            for g in ("area", "environment")
         ),
     ]
 

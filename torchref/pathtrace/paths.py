@@ -22,6 +22,7 @@ from torchref.pathtrace.emitters import (
 from torchref.pathtrace.environment import look_up
 from torchref.pathtrace.hit_points import HitSurface, SurfaceTable
 from torchref.pathtrace.low_discrepancy import Words, uniform_pair
+from torchref.pathtrace.ray_offset import offset_origin
 from torchref.pathtrace.scatter import Reflector, density, draw, evaluate
 from torchref.vec3 import Scalar, Vec3, from_array, to_array
 from torchref.vecmath import dot
@@ -143,10 +144,8 @@ def go_on(at: Reflector, path: Path, seeds: Words, index: Int[Tensor, ""], *, ve
 
 @in_float64
 def offset(at: Reflector, direction: Vec3) -> Vec3:
-    """A step along the triangle's normal, to the side of the direction: 4·10⁻⁶ of the largest coordinate and 10⁻⁷."""
-    position, n = to_array(at.position), to_array(at.geometric_normal)
-    side = torch.where(dot(n, to_array(direction)) < 0.0, -1.0, 1.0)
-    return from_array(position + side * n * (position.abs().amax(dim=1, keepdim=True) * 4e-6 + 1e-7))
+    """`offset_origin` of the position."""
+    return from_array(offset_origin(to_array(at.position), to_array(at.geometric_normal), to_array(direction)))
 
 
 @in_float64

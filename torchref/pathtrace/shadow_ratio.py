@@ -24,6 +24,7 @@ def shadow_ratio(
     return torch.where(dark, 1.0, arrived / torch.where(dark, 1.0, unshadowed)).clamp(0.0, 1.0)
 
 
-def ratio_radius(shadow_rays: int) -> int:
-    """3 rays^(-3/5), to the next whole number, at least 1."""
-    return max(1, round(3.0 / shadow_rays ** (3 / 5)))
+def ratio_radius(shadow_rays: int, *, group: str) -> int:
+    """3 rays^(-3/5) for lamps, 12 rays^(-1/2) for the surroundings, to the next whole number, at least 1."""
+    first, power = {"area": (3.0, 3 / 5), "environment": (12.0, 1 / 2)}[group]
+    return max(1, round(first / shadow_rays**power))
