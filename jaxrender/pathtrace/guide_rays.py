@@ -14,7 +14,7 @@ from jaxrender.machine import on_all_cores
 from jaxrender.pathtrace import programs
 from jaxrender.pathtrace.emitters import Emitters, only
 from jaxrender.pathtrace.paths import Path, Vertex
-from jaxrender.pathtrace.programs import BLOCK, View, light_up, make_view, rows
+from jaxrender.pathtrace.programs import View, light_up, make_view, rows
 from jaxrender.pathtrace.scatter import Reflector
 from jaxrender.pathtrace.settings import TraceSettings
 from jaxrender.pathtrace.world import World
@@ -86,11 +86,11 @@ def trace_guides(
     checks.check_at_least("height", height, 1)
     checks.check_at_least("width", width, 1)
     view = make_view(camera, height=height)
+    starts, size = programs.blocks(height * width)
     trace = functools.partial(
-        _block, world, view, height=height, width=width, settings=settings, first_sample=first_sample
+        _block, world, view, block=size, height=height, width=width, settings=settings, first_sample=first_sample
     )
-    blocks = list(on_all_cores(trace, range(0, height * width, BLOCK)))
-    return Traced(**joined(blocks, height=height, width=width))
+    return Traced(**joined(list(on_all_cores(trace, starts)), height=height, width=width))
 
 
 def pooled(first: Traced, second: Traced, *, counts: tuple[int, int]) -> Traced:
@@ -128,26 +128,27 @@ def joined(blocks: list[dict[str, np.ndarray]], *, height: int, width: int) -> d
 
 
 def _block(
-    world: World, view: View, start: int, *, height: int, width: int, settings: TraceSettings, first_sample: int
-) -> dict[str, np.ndarray]:
-    """All images of `BLOCK` pixels, row by row, from pixel `start` on."""
+    world: World, view: View, start: int, *, block: int, height: int, width: int, settings: TraceSettings,
+    first_sample: int,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """All images of `block` pixels, row by row, from pixel `start` on."""
     spp, model, by_ratio = settings.samples_per_pixel, settings.model, settings.by_ratio
-    rays, seeds = programs.eye_rays(view, start, settings.seed, 0, height=height, width=width)
+    rays, seeds = programs.eye_rays(view, start, settings.seed, 0, block=block, height=height, width=width)
     at, path, images = programs.see(world, view, rays, model=model, by_ratio=by_ratio)
     scattered = spp if settings.bounces else 0
     vertex = Vertex(0, settings.light_samples, scattered, model)
-    sums = {name: np.zeros((BLOCK, 3), np.float32) for name in ("even", "odd", "squares", "met", "ao")}
+    sums = {name: np.zeros((block, 3), np.float32) for name in ("even", "odd", "squares", "met", "ao")}
     # Plain, each eye ray finds soft light for itself; by ratio, the guide ray finds it for all.
     shares = spp if by_ratio else 1
     soft, hard = soft_groups(world.emitters), only(world.emitters, SHARP)
-    arrived, unshadowed = np.zeros((2, BLOCK, 3 * len(soft)), np.float32)
+    arrived, unshadowed = np.zeros((2, block, 3 * len(soft)), np.float32)
     for group, emitters in enumerate(soft):
         own = slice(3 * group, 3 * group + 3)
         for sample in range(first_sample, first_sample + shares):
             seen, whole = light_up(world, emitters, at, path, seeds, sample, vertex=vertex)
             arrived[:, own] += seen / shares
             unshadowed[:, own] += whole / shares
-    sharp = np.zeros((BLOCK, 3), np.float32)
+    sharp = np.zeros((block, 3), np.float32)
     if hard.groups:
         sharp = light_up(world, hard, at, path, seeds, first_sample, vertex=vertex)[0]
     radii = world.extent * np.asarray(AO_RADII, np.float32)
@@ -180,7 +181,8 @@ def _follow(
       direct light that the first scattered ray meets, incident indirect light over the reflectance, and openness.
     """
     model, spp, index = settings.model, settings.samples_per_pixel, np.int32(sample)
-    light, share = np.zeros((BLOCK, 3), np.float32), rows(programs.reflected_share(at))
+    share = rows(programs.reflected_share(at))
+    light = np.zeros_like(share)
     vertex = Vertex(0, settings.light_samples, spp, model)
     for number in range(1, settings.bounces + 1):
         rays, path = programs.scatter(at, path, seeds, index, vertex=vertex)

@@ -33,7 +33,7 @@ from jaxrender.pathtrace.scatter import Reflector, draw, make_reflector, reflect
 from jaxrender.pathtrace.world import World
 from jaxrender.vec3 import Vec3
 
-#: Pixels of a block: what a path holds on to stays in the processor's cache.
+#: Most pixels of a block: what a path holds on to stays in the processor's cache.
 BLOCK = 1 << 14
 
 #: Glossy surfaces below this roughness mirror lamps: scattered rays must look for them, too.
@@ -41,6 +41,12 @@ SMOOTH = 0.3
 
 # Pairs of random numbers by which eye rays leave the centre of their pixel, and those of occlusion rays.
 _LENS, _OCCLUSION = 1000, 1001
+
+
+def blocks(num_pixels: int) -> tuple[range, int]:
+    """Where the blocks of a picture start, and their size; the last one reaches beyond the last pixel."""
+    size = min(BLOCK, max(256, 1 << max(num_pixels - 1, 0).bit_length()))
+    return range(0, num_pixels, size), size
 
 
 class View(NamedTuple):
@@ -108,7 +114,7 @@ def light_up(
 
     Only rays that would bring light are traced.
     """
-    arrived, unshadowed = np.zeros((2, BLOCK, 3), np.float32)
+    arrived, unshadowed = np.zeros((2, len(seeds), 3), np.float32)
     for shadow in _draw_lights(emitters, world.table, at, path, seeds, np.int32(index), vertex=vertex):
         light = rows(shadow.light)
         unshadowed += light
@@ -120,17 +126,18 @@ def light_up(
     return arrived, unshadowed
 
 
-@functools.partial(jax.jit, static_argnames=("height", "width"))
-def eye_rays(view: View, start, seed, sample, *, height: int, width: int) -> tuple[Rays, Array]:
-    """Rays of one sample of `BLOCK` pixels, and the seeds of the pixels; those past the last repeat it.
+@functools.partial(jax.jit, static_argnames=("block", "height", "width"))
+def eye_rays(view: View, start, seed, sample, *, block: int, height: int, width: int) -> tuple[Rays, Array]:
+    """Rays of one sample of `block` pixels from `start` on, and the seeds of the pixels; those past the last repeat it.
 
     Sample 0 passes through the centres, the others where a sequence of low discrepancy puts them.
     """
-    pixel = jnp.minimum(jnp.asarray(start, jnp.int32) + jnp.arange(BLOCK, dtype=jnp.int32), height * width - 1)
+    pixel = jnp.minimum(jnp.asarray(start, jnp.int32) + jnp.arange(block, dtype=jnp.int32), height * width - 1)
     seeds = pixel_seeds(pixel, jnp.asarray(seed, jnp.int32))
     sample = jnp.broadcast_to(jnp.asarray(sample, jnp.int32), pixel.shape)
     x, y = (jnp.where(sample == 0, 0.5, offset) for offset in uniform_pair(sample, seeds, dimension=_LENS))
-    x, y = ((pixel % width) + x - 0.5 * width) * view.step, (0.5 * height - (pixel // width) - y) * view.step
+    row, column = ((pixel // width).astype(x.dtype), (pixel % width).astype(x.dtype))
+    x, y = (column + x - 0.5 * width) * view.step, (0.5 * height - row - y) * view.step
     eye = Vec3(*(jnp.broadcast_to(c, pixel.shape) for c in view.eye))
     return Rays(eye, vec3.normalize(view.right * x + view.up * y - view.backward)), seeds
 

@@ -22,7 +22,7 @@ from jaxrender.pathtrace import programs
 from jaxrender.pathtrace.emitters import only
 from jaxrender.pathtrace.guide_rays import SHARP, Traced, joined, soft_groups, sum_of_groups, trace_guides
 from jaxrender.pathtrace.paths import Vertex
-from jaxrender.pathtrace.programs import BLOCK, light_up, make_view, rows, unshadowed_light
+from jaxrender.pathtrace.programs import light_up, make_view, rows, unshadowed_light
 from jaxrender.pathtrace.settings import TraceSettings
 from jaxrender.pathtrace.shadow_ratio import UNSHADOWED, filtered_ratio, ratio_radius
 from jaxrender.pathtrace.world import World, prepare
@@ -86,7 +86,7 @@ def render_indirect(
 
 def filter_incident(guides: Traced, settings: TraceSettings) -> tuple[np.ndarray, dict[str, float | int | str]]:
     """The indirect light of guide rays, filtered by normals, depths and ambient occlusion; and the settings."""
-    if settings.method == "none" or settings.bounces == 0:
+    if settings.method == "none" or settings.bounces == 0 or not guides.normal.any():
         return guides.incident, {"method": "none"}
     aovs = Aovs(
         guides.incident, direct=np.zeros_like(guides.incident), indirect=guides.incident, normal=guides.normal,
@@ -107,13 +107,14 @@ def combine(
     """All eye rays: each has its own surface and direct light, and the filtered light of the guide ray most like it."""
     height, width = guides.incident.shape[:2]
     spp = settings.samples_per_pixel
-    looked_up = [incident]
+    looked_up = [incident, guides.met / np.maximum(guides.albedo, 1e-3)]
     if settings.by_ratio:
-        looked_up += [guides.met / np.maximum(guides.albedo, 1e-3), *_ratios(world, guides, settings)]
+        looked_up += _ratios(world, guides, settings)
     images = jnp.asarray(np.concatenate(looked_up, axis=-1)), jnp.asarray(guides.normal), jnp.asarray(guides.depth)
-    trace = functools.partial(_block, world, camera, guides, images, height=height, width=width, settings=settings)
-    blocks = list(on_all_cores(trace, range(0, height * width, BLOCK)))
-    parts = {name: image / spp for name, image in joined(blocks, height=height, width=width).items()}
+    starts, size = programs.blocks(height * width)
+    trace = functools.partial(_block, world, camera, guides, images, block=size, settings=settings)
+    sums = joined(list(on_all_cores(trace, starts)), height=height, width=width)
+    parts = {name: image / spp for name, image in sums.items()}
     image = sum(parts.values(), np.zeros_like(incident))
     return Rendered(image, **parts, incident=incident, guides=guides, chosen=chosen or {})
 
@@ -132,35 +133,37 @@ def _ratios(world: World, guides: Traced, settings: TraceSettings) -> list[np.nd
 
 
 def _block(
-    world: World, camera: Camera, guides: Traced, images: tuple[Array, Array, Array], start: int, *, height: int,
-    width: int, settings: TraceSettings,
+    world: World, camera: Camera, guides: Traced, images: tuple[Array, Array, Array], start: int, *, block: int,
+    settings: TraceSettings,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """Sums over eye rays, for `BLOCK` pixels."""
+    """Sums over eye rays, for `block` pixels."""
+    height, width = guides.incident.shape[:2]
     view, spp, model = make_view(camera, height=height), settings.samples_per_pixel, settings.model
     soft, hard = soft_groups(world.emitters), only(world.emitters, SHARP)
-    own = {name: _cut(getattr(guides, name), start) for name in ("arrived", "sharp", "met", "emission", "albedo")}
-    sums = {name: np.zeros((BLOCK, 3), np.float32) for name in ("direct", "indirect", "emission")}
+    own = {
+        name: _cut(getattr(guides, name), start, block) for name in ("arrived", "sharp", "met", "emission", "albedo")
+    }
+    sums = {name: np.zeros((block, 3), np.float32) for name in ("direct", "indirect", "emission")}
     vertex = Vertex(0, settings.light_samples, spp if settings.bounces else 0, model)
     for sample in range(spp):
         if sample == 0 and not (settings.by_ratio and soft):
             # All is known of guide rays already.
             sums["direct"] += sum_of_groups(own["arrived"]) + own["sharp"] + own["met"]
             sums["emission"] += own["emission"]
-            sums["indirect"] += own["albedo"] * _cut(np.asarray(images[0][..., :3]), start)
+            sums["indirect"] += own["albedo"] * _cut(np.asarray(images[0][..., :3]), start, block)
             continue
-        rays, seeds = programs.eye_rays(view, start, settings.seed, sample, height=height, width=width)
-        at, path, seen = programs.see(world, view, rays, model=model, by_ratio=settings.by_ratio)
+        rays, seeds = programs.eye_rays(view, start, settings.seed, sample, block=block, height=height, width=width)
+        at, path, seen = programs.see(world, view, rays, model=model, by_ratio=True)
         found = np.asarray(programs.look_up_guides(*images, camera, seen, height=height, width=width))
         sums["emission"] += seen["emission"]
         sums["indirect"] += seen["albedo"] * found[:, :3]
         if hard.groups:
             sums["direct"] += light_up(world, hard, at, path, seeds, sample, vertex=vertex)[0]
-        if settings.by_ratio:
-            sums["direct"] += seen["albedo"] * found[:, 3:6]
+        # Lamps that smooth surfaces mirror are met by the guides' paths only.
+        sums["direct"] += np.where(np.asarray(path.shared)[:, None], seen["albedo"] * found[:, 3:6], np.float32(0.0))
         for group, emitters in enumerate(soft):
             if not settings.by_ratio:
-                plain = vertex._replace(scattered=0)
-                sums["direct"] += light_up(world, emitters, at, path, seeds, sample, vertex=plain)[0]
+                sums["direct"] += light_up(world, emitters, at, path, seeds, sample, vertex=vertex)[0]
                 continue
             many = vertex._replace(drawn=max(1, UNSHADOWED // spp))
             whole = rows(unshadowed_light(emitters, world.table, at, path, seeds, np.int32(sample), vertex=many))
@@ -168,7 +171,7 @@ def _block(
     return sums
 
 
-def _cut(image: Float[np.ndarray, "h w c"], start: int) -> np.ndarray:
-    """`BLOCK` pixels from pixel `start` on; past the last, zeros."""
-    pixels = image.reshape(-1, image.shape[-1])[start : start + BLOCK]
-    return np.pad(pixels, [(0, BLOCK - len(pixels)), (0, 0)])
+def _cut(image: Float[np.ndarray, "h w c"], start: int, count: int) -> np.ndarray:
+    """`count` pixels from pixel `start` on; past the last, zeros."""
+    pixels = image.reshape(-1, image.shape[-1])[start : start + count]
+    return np.pad(pixels, [(0, count - len(pixels)), (0, 0)])
