@@ -5,11 +5,12 @@ from jaxtyping import Array, Float, Int
 
 from jaxrender.checks import check_last_axis, check_same_shape
 
-#: Differences below these shares of the range count as none: a wall's rounding must not decide.
+#: Largest distances below these are taken for these: on a wall, rounding of depth must not fill the range.
 NORMAL_FLOOR, DEPTH_FLOOR = 1e-3, 1e-3
 
-#: Scores that differ by less are tied: 1 - d / max d is not exactly 0 where d is the largest.
-TIE = 1e-6
+#: Scores that differ by less are tied: depths a millionth apart on a wall, or 1 - d / max d for the largest d, which
+#: is not exactly 0.
+TIE = 1e-3
 
 
 def guide_lookup(
@@ -25,8 +26,8 @@ def guide_lookup(
 
     Of the four pixel centres around a place, the one with the largest s_i = s_N,i s_D,i is taken:
     s_N,i = 1 - ||N_a - N_i|| / max_j ||N_a - N_j|| and s_D,i = 1 - |D_a - D_i| / max_j |D_a - D_j|. Where a maximum is
-    below a floor (`NORMAL_FLOOR`; `DEPTH_FLOOR` times the sample's depth) the floor stands for it. Ties go to the more
-    similar normal, then to the nearer centre. Guides without a surface (normal 0) are taken only if all four are.
+    below a floor (`NORMAL_FLOOR`; `DEPTH_FLOOR` times the sample's depth) the floor stands for it. Ties (scores within
+    `TIE`) go to the more similar normal, then to the nearer centre. Guides without a surface (normal 0) are taken only if all four are.
 
     Differentiable in `image`; which pixel is taken has no gradient.
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchref._precision import in_float64
 
 NORMAL_FLOOR, DEPTH_FLOOR = 1e-3, 1e-3
-TIE = 1e-6
+TIE = 1e-3
 
 
 @in_float64
