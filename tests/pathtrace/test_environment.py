@@ -116,7 +116,10 @@ def test_a_black_image_brings_nothing_and_no_nan(rng):
 
 def test_the_ends_of_the_numbers_are_in_texels_with_light(image):
     largest = np.float32(1.0) - np.finfo(np.float32).epsneg
-    ends = jnp.asarray([0.0, 0.0, largest, largest], jnp.float32), jnp.asarray([0.0, largest, 0.0, largest], jnp.float32)
+    ends = (
+        jnp.asarray([0.0, 0.0, largest, largest], jnp.float32),
+        jnp.asarray([0.0, largest, 0.0, largest], jnp.float32),
+    )
     image[0], image[-1], image[:, 0], image[:, -1] = 0.0, 0.0, 0.0, 0.0
     drawn = draw_direction(make_environment(image), *ends)
     assert (np.asarray(drawn.density) > 0.0).all() and np.isfinite(rows(drawn.direction)).all()
