@@ -27,7 +27,8 @@ def guide_lookup(
     Of the four pixel centres around a place, the one with the largest s_i = s_N,i s_D,i is taken:
     s_N,i = 1 - ||N_a - N_i|| / max_j ||N_a - N_j|| and s_D,i = 1 - |D_a - D_i| / max_j |D_a - D_j|. Where a maximum is
     below a floor (`NORMAL_FLOOR`; `DEPTH_FLOOR` times the sample's depth) the floor stands for it. Ties (scores within
-    `TIE`) go to the more similar normal, then to the nearer centre. Guides without a surface (normal 0) are taken only if all four are.
+    `TIE`) go to the more similar normal, then to the nearer centre. Guides without a surface (normal 0) are taken only
+    if all four are.
 
     Differentiable in `image`; which pixel is taken has no gradient.
 

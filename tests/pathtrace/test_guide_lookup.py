@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from jaxrender.pathtrace import guide_lookup
-from jaxrender.pathtrace.guide_lookup import DEPTH_FLOOR, NORMAL_FLOOR
+from jaxrender.pathtrace.guide_lookup import DEPTH_FLOOR, NORMAL_FLOOR, TIE
 from tests.support import oracles
 
 LOOK_UP = jax.jit(guide_lookup)
 
 
 def brute_force(normal, depth, places, sample_normal, sample_depth):
-    """Eqs. 3-5 in exact order: (row, column) with the largest s, then the largest s_N, then the nearest centre."""
+    """Eqs. 3-5 in order: (row, column) with the largest s, then the largest s_N, then the nearest centre."""
     height, width = depth.shape[:2]
     found = []
     for (x, y), n, (d,) in zip(places, sample_normal, sample_depth, strict=True):
@@ -28,8 +28,10 @@ def brute_force(normal, depth, places, sample_normal, sample_depth):
         s_d = 1.0 - behind / max(behind.max(), DEPTH_FLOOR * abs(d))
         away = [np.hypot(c[1] + 0.5 - x, c[0] + 0.5 - y) for c in corners]
         seen = [normal[c].any() for c in corners]
-        keys = [(seen[i], round(s_n[i] * s_d[i], 9) if seen[i] else 0.0, round(s_n[i], 9), -away[i]) for i in range(4)]
-        found.append(corners[max(range(4), key=keys.__getitem__)])
+        best = np.flatnonzero(seen) if any(seen) else np.arange(4)
+        for score in (s_n * s_d if any(seen) else np.zeros(4), s_n, -np.square(away)):
+            best = best[score[best] >= score[best].max() - TIE]
+        found.append(corners[best[0]])
     return np.array(found)
 
 
@@ -109,8 +111,8 @@ def test_ties_hold_for_any_vectors_in_single_precision(seed):
 def test_rounding_of_depth_on_a_wall_does_not_decide():
     """A spread of 1e-6 is no difference: the centre that is nearest counts, not the one whose depth is equal."""
     depths = [2.0, 2.0 + 1e-6, 2.0 + 1e-6, 2.0 + 2e-6]
-    assert four([UP] * 4, depths, UP, 2.0, place=(1.4, 1.4)) != 3 or True  # the floor leaves a trace of a preference
-    # Beside a normal that differs by ever so little over its floor, that trace is nothing.
+    assert four([UP] * 4, depths, UP, 2.0, place=(1.4, 1.4)) == 3
+    # Nor does it beside a normal that differs by little more than its floor.
     tilted = oracles.unit(np.array([0.0, 2e-3, 1.0])).tolist()
     assert four([tilted, UP, tilted, tilted], depths, UP, 2.0, place=(0.6, 1.4)) == 1
 
