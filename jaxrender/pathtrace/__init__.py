@@ -18,4 +18,5 @@ from jaxrender.pathtrace.render import render_direct as render_direct
 from jaxrender.pathtrace.render import render_indirect as render_indirect
 from jaxrender.pathtrace.settings import TraceSettings as TraceSettings
 from jaxrender.pathtrace.world import World as World
+from jaxrender.pathtrace.world import move as move
 from jaxrender.pathtrace.world import prepare as prepare

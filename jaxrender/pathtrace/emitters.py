@@ -19,6 +19,9 @@ from jaxrender.pathtrace.hit_points import HitSurface, SurfaceTable, hit_surface
 from jaxrender.scene import DIRECTIONAL, Lights, Scene
 from jaxrender.vec3 import Scalar, Vec3, dot
 
+#: Kinds of lights, in the order in which they are drawn.
+ALL_GROUPS = ("area", "lights", "environment")
+
 #: Barycentric coordinates at which the emission of a triangle is read for the tables.
 _PROBES = ((1 / 3, 1 / 3), (0.1, 0.1), (0.8, 0.1), (0.1, 0.8))
 

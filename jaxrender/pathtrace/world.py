@@ -1,12 +1,13 @@
 """A scene made ready for paths: surfaces by triangle, lights, and rays."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrender.deferred.pipeline import default_lights
-from jaxrender.pathtrace.emitters import Emitters, make_emitters
+from jaxrender.pathtrace.emitters import ALL_GROUPS, Emitters, make_emitters
 from jaxrender.pathtrace.hit_points import SurfaceTable, surface_table
 from jaxrender.pathtrace.ray_scene import RayScene
 from jaxrender.scene import Lights, Scene, scene_bounds
@@ -34,9 +35,7 @@ def prepare(
     Raises:
       ValueError: naming the field, if positions are not finite.
     """
-    positions = np.asarray(scene.positions)
-    if not np.isfinite(positions[np.asarray(scene.faces)]).all():
-        raise ValueError("scene.positions: expected finite numbers, got NaN or Inf")
+    _check_finite(scene)
     table = surface_table(scene)
     emitters = make_emitters(scene, table, lights=lights, environment=environment)
     notes: tuple[str, ...] = ()
@@ -57,3 +56,27 @@ def sky_image(ambient: Float[Array, "3 k"], *, height: int = 32) -> Float[np.nda
     x, y, z = np.broadcast_arrays(s * np.sin(phi), c, -s * np.cos(phi))
     basis = np.stack([np.asarray(b) for b in basis_columns(x, y, z, order=order)], axis=-1)
     return np.maximum(basis @ np.asarray(ambient, np.float64).T, 0.0).astype(np.float32)
+
+
+def move(world: World, scene: Scene) -> World:
+    """The world of the same scene in another pose: with the same faces, materials and images.
+
+    Textures, lights without extent and surroundings stay; so does `extent`, so that guides mean the same in all frames.
+
+    Raises:
+      ValueError: if the number of triangles differs, or positions are not finite.
+    """
+    count = len(world.table.material_id)
+    if len(scene.faces) != count:
+        raise ValueError(f"scene.faces: expected {count}, as before, got {len(scene.faces)}")
+    _check_finite(scene)
+    table = surface_table(scene, textures=world.table.textures)
+    emitters = make_emitters(scene, table, lights=world.emitters.lights)
+    groups = tuple(group for group in ALL_GROUPS if group in (*emitters.groups, *world.emitters.groups))
+    emitters = dataclasses.replace(emitters, environment=world.emitters.environment, groups=groups)
+    return World(table, emitters, RayScene(scene, table), world.extent, world.notes)
+
+
+def _check_finite(scene: Scene) -> None:
+    if not np.isfinite(np.asarray(scene.positions)[np.asarray(scene.faces)]).all():
+        raise ValueError("scene.positions: expected finite numbers, got NaN or Inf")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxrender.camera import Camera
-from jaxrender.pathtrace import TraceSettings, prepare, render, render_direct, render_indirect
+from jaxrender.pathtrace import TraceSettings, move, prepare, render, render_direct, render_indirect
 from jaxrender.pathtrace.guide_rays import pooled, trace_guides
 from jaxrender.scene import DIRECTIONAL, MASK, POINT, SPOT, SceneImage
 from tests.support.rooms import light, matt, polygon_irradiance, room, sphere, square
@@ -256,6 +256,25 @@ def test_a_scene_without_light_gets_a_sun_and_says_so():
     assert not prepare(room(floor()), environment=WHITE).notes
 
 
+def test_a_world_that_moves_is_the_one_built_anew():
+    """Lamp and ball move; textures and surroundings are kept."""
+
+    def pose(x):
+        lamp = square((x, 1.5, 0.2), (0.4, 0, 0), (0, 0, 0.5), matt((0, 0, 0), emissive=(3.0, 3.0, 3.0)))
+        ball = sphere(matt((0.7, 0.3, 0.2)), radius=0.4)
+        return room(floor(), (ball[0] + np.array([0.0, 0.3 + x, 0.0]), *ball[1:]), lamp)
+
+    first = prepare(pose(0.0), environment=0.3 * WHITE)
+    moved = move(first, pose(0.5))
+    anew = prepare(pose(0.5), environment=0.3 * WHITE)
+    found, truth = (trace_guides(world, ABOVE, settings=PLAIN, **SIZE) for world in (moved, anew))
+    for name in ("arrived", "incident", "normal", "emission"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(truth, name))
+    assert moved.extent == first.extent and moved.emitters.groups == ("area", "environment")
+    with pytest.raises(ValueError, match=r"scene\.faces: expected"):
+        move(first, room(floor()))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -276,7 +295,7 @@ def test_settings_out_of_range_are_named(change, message):
 def test_bad_scenes_are_refused():
     scene = room(floor())
     spoiled = dataclasses.replace(scene, positions=scene.positions.at[0, 0].set(jnp.inf))
-    with pytest.raises(ValueError, match=r"scene.positions: expected finite numbers"):
+    with pytest.raises(ValueError, match=r"scene\.positions: expected finite numbers"):
         prepare(spoiled)
 
 

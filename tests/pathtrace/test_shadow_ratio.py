@@ -89,18 +89,22 @@ def test_the_noise_of_light_that_is_not_hidden_cancels(rng):
     np.testing.assert_allclose(ratio(0.5 * light, light, radius=2), 0.5, atol=1e-5)
 
 
-@pytest.mark.parametrize(("rays", "radius"), [(1, 3), (2, 2), (4, 1), (16, 1), (1000, 1)])
-def test_the_rule_for_the_radius(rays, radius):
-    assert ratio_radius(rays) == radius
+@pytest.mark.parametrize(
+    ("group", "rays", "radius"),
+    [("area", 1, 3), ("area", 2, 2), ("area", 4, 1), ("area", 16, 1), ("area", 1000, 1), ("environment", 1, 12),
+     ("environment", 4, 6), ("environment", 16, 3), ("environment", 10_000, 1)],
+)  # fmt: skip
+def test_the_rule_for_the_radius(group, rays, radius):
+    assert ratio_radius(rays, group=group) == radius
 
 
 def test_the_ratio_of_a_picture_has_its_guides_and_its_radius(rng):
-    """With flat guides it is `shadow_ratio` of the rule's radius."""
+    """With flat guides it is `shadow_ratio` without any."""
     light = rng.uniform(0.5, 1.0, (12, 14, 3)).astype(np.float32)
     arrived = (light * (rng.uniform(size=(12, 14, 1)) < 0.5)).astype(np.float32)
     flat = {"normal": np.tile(np.float32([0, 0, 1]), (12, 14, 1)), "depth": np.ones((12, 14, 1), np.float32),
             "ao": np.ones((12, 14, 1), np.float32)}  # fmt: skip
-    found = filtered_ratio(arrived, light, **flat, shadow_rays=2)
+    found = filtered_ratio(arrived, light, **flat, radius=2)
     np.testing.assert_allclose(found, ratio(arrived, light, radius=2), atol=1e-5)
 
 
