@@ -21,6 +21,7 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "adaptive": "benchmarks.adaptive",
         "filters": "benchmarks.filters",
         "harmonics": "benchmarks.harmonics",
+        "pathtrace": "benchmarks.pathtrace",
         "raster": "benchmarks.raster",
     }
 )

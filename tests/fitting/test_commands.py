@@ -121,7 +121,7 @@ def test_a_model_that_does_not_fit_is_refused_in_one_line(run, tmp_path, capsys,
 
 
 def test_the_readme_examples_run_as_printed(run, monkeypatch):
-    relit, raster, whole, adaptive, filters = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
+    relit, raster, whole, adaptive, filters, traced = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
     monkeypatch.chdir(run)
     names: dict = {}
     exec(raster, names)
@@ -136,6 +136,8 @@ def test_the_readme_examples_run_as_printed(run, monkeypatch):
     assert names["first"].sample_share <= 0.2
     exec(filters, names)
     assert names["clean"].shape == names["result"].image.shape == (36, 48, 3)
+    exec(traced.replace("height=768, width=1024", "height=36, width=48"), names)
+    assert names["traced"].image.shape == (36, 48, 3) and names["traced"].image.max() > 0.05
     exec(relit, names)
     positions, colors = np.asarray(names["positions"]), np.asarray(names["colors"])
     assert positions.shape == colors.shape == (3273, 3)
