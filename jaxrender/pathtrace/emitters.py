@@ -160,13 +160,11 @@ def _mean_emission(table: SurfaceTable, triangle: Int[np.ndarray, " m"]) -> Floa
     """Over channels and over some points of each triangle."""
     if not len(triangle):
         return np.zeros(0)
-    total = np.zeros(len(triangle))
-    for probe in _PROBES:
-        barycentrics = jnp.broadcast_to(jnp.asarray(probe, jnp.float32), (len(triangle), 2))
-        down = Vec3(*(jnp.full(len(triangle), x, jnp.float32) for x in (0.0, -1.0, 0.0)))
-        surface = hit_surface(table, jnp.asarray(triangle), barycentrics, down)
-        total += np.asarray(vec3.mean(surface.emissive), np.float64)
-    return total / len(_PROBES)
+    count = len(triangle)
+    barycentrics = jnp.asarray(np.tile(_PROBES, (count, 1)), jnp.float32)
+    down = Vec3(*(jnp.full(len(barycentrics), x, jnp.float32) for x in (0.0, -1.0, 0.0)))
+    surface = _hit_surface(table, jnp.asarray(np.repeat(triangle, len(_PROBES))), barycentrics, down)
+    return np.asarray(vec3.mean(surface.emissive), np.float64).reshape(count, len(_PROBES)).mean(axis=1)
 
 
 def _light_power(lights: Lights) -> Float[np.ndarray, " n"]:
@@ -189,3 +187,6 @@ def emitted(emitters: Emitters, surface: HitSurface) -> Vec3:
 def only(emitters: Emitters, groups: tuple[str, ...]) -> Emitters:
     """The same with some of its groups; rays still meet the others."""
     return replace(emitters, groups=tuple(group for group in emitters.groups if group in groups))
+
+
+_hit_surface = jax.jit(hit_surface)
