@@ -18,6 +18,7 @@ from jaxrender.deferred.texture import Textures, sample_bilinear, sample_triline
 from jaxrender.scene import Material, Scene
 from jaxrender.vec3 import Scalar, Vec3, dot, normalize
 from jaxrender.vecmath import normalize as normalize_rows
+from jaxrender.vecmath import safe_div, safe_sqrt
 
 #: Columns by attribute of one corner.
 _WIDTH = {"position": 3, "normal": 3, "uv": 2, "color": 4, "tangent": 4}
@@ -104,19 +105,27 @@ def surface_table(scene: Scene, *, textures: Textures | MaterialTextures | None 
         by_name["color"] = scene.colors
     if "normal_texture" in slots:
         by_name["tangent"] = scene.tangents
-    values = jnp.concatenate(list(by_name.values()), axis=1)
-    a, b, c = (values[scene.faces[:, k]] for k in range(3))
-    p, q = (x[scene.faces] for x in (scene.positions, scene.uv))
-    doubled = jnp.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
-    edge_1, edge_2 = q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
-    uv_area = jnp.abs(edge_1[:, 0] * edge_2[:, 1] - edge_1[:, 1] * edge_2[:, 0])
-    area = jnp.sqrt(jnp.sum(doubled * doubled, axis=1))
-    density = jnp.where(area > 0.0, jnp.sqrt(uv_area / jnp.where(area > 0.0, area, 1.0)), 0.0)
     return SurfaceTable(
-        corners=jnp.concatenate([a, b - a, c - a, normalize_rows(doubled), density[:, None]], axis=1),
+        corners=_corner_rows(tuple(by_name.values()), scene.faces, scene.positions, scene.uv),
         material_id=scene.material_id, material=scene.material, textures=textures, attributes=tuple(by_name),
         slots=slots,
     )  # fmt: skip
+
+
+@jax.jit
+def _corner_rows(
+    attributes: tuple[Float[Array, "v _"], ...], faces: Int[Array, "t 3"], positions: Float[Array, "v 3"],
+    uv: Float[Array, "v 2"],
+) -> Float[Array, "t c"]:  # fmt: skip
+    """`SurfaceTable.corners`; one program, where this many single steps would be compiled each for itself."""
+    values = jnp.concatenate(attributes, axis=1)
+    a, b, c = (values[faces[:, k]] for k in range(3))
+    p, q = (x[faces] for x in (positions, uv))
+    doubled = jnp.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    edge_1, edge_2 = q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
+    uv_area = jnp.abs(edge_1[:, 0] * edge_2[:, 1] - edge_1[:, 1] * edge_2[:, 0])
+    density = safe_sqrt(safe_div(uv_area, safe_sqrt(jnp.sum(doubled * doubled, axis=1))))
+    return jnp.concatenate([a, b - a, c - a, normalize_rows(doubled), density[:, None]], axis=1)
 
 
 def hit_surface(

@@ -207,3 +207,18 @@ def test_gradients_in_positions_normals_and_colors_are_those_of_finite_differenc
         slope = (compiled(moved[0]) - compiled(moved[1])) / (2.0 * h)
         assert abs(slope) > 1e-3, name
         np.testing.assert_allclose(jnp.sum(slopes[i] * step), slope, rtol=1e-5, err_msg=name)
+
+
+def test_gradients_in_positions_are_finite_without_texture_coordinates_and_area(rng):
+    """Roots of 0 in the density of texture coordinates must not spoil what does not depend on it."""
+    positions = np.concatenate([rng.normal(size=(3, 3)), np.ones((3, 3))])
+    scene = make_scene(positions, [[0, 1, 2], [3, 4, 5]], material=plain_material())
+
+    def value(positions):
+        table = surface_table(dataclasses.replace(scene, positions=positions))
+        triangle, places = jnp.zeros(1, jnp.int32), jnp.full((1, 2), 0.2, jnp.float32)
+        return sum(jnp.sum(c) for c in hit_surface(table, triangle, places, vec([[0.0, 0.6, 0.8]])).position)
+
+    expected = np.zeros((6, 3))
+    expected[:3] = np.array([0.6, 0.2, 0.2])[:, None]
+    np.testing.assert_allclose(jax.jit(jax.grad(value))(scene.positions), expected, rtol=1e-5, atol=1e-6)
