@@ -180,12 +180,12 @@ def _follow(
     Returns:
       direct light that the first scattered ray meets, incident indirect light over the reflectance, and openness.
     """
-    model, spp, index = settings.model, settings.samples_per_pixel, np.int32(sample)
+    model, spp = settings.model, settings.samples_per_pixel
     share = rows(programs.reflected_share(at))
     light = np.zeros_like(share)
     vertex = Vertex(0, settings.light_samples, spp, model)
     for number in range(1, settings.bounces + 1):
-        rays, path = programs.scatter(at, path, seeds, index, vertex=vertex)
+        rays, path = programs.scatter(at, path, seeds, sample, vertex=vertex)
         hits, surface = programs.hit(world, rays, None)
         met = rows(programs.meet(world.emitters, path, rays.direction, hits.t, surface, left=vertex))
         if number == 1:

@@ -19,7 +19,9 @@ def pixel_seeds(pixel: Int[Array, "*b"], seed: int | Int[Array, ""]) -> Words:
     return hash_words(pixel.astype(jnp.uint32) ^ hash_words(jnp.asarray(seed).astype(jnp.uint32)))
 
 
-def uniform_pair(index: Int[Array, "*b"], seed: Words, *, dimension: int) -> tuple[Float[Array, "*b"], ...]:
+def uniform_pair(
+    index: Int[Array, "*b"], seed: Words, *, dimension: int | Int[Array, ""]
+) -> tuple[Float[Array, "*b"], ...]:
     """Two numbers in [0, 1): point `index` of the sequence of a seed.
 
     Any 2^k points from a multiple of 2^k on are stratified: one falls in each of the 2^k elementary boxes of every
@@ -29,7 +31,7 @@ def uniform_pair(index: Int[Array, "*b"], seed: Words, *, dimension: int) -> tup
       index: below 2^31, broadcast against `seed`.
       dimension: which pair of dimensions; each is a sequence of its own.
     """
-    own = hash_words(seed ^ jnp.uint32(0x9E3779B9 * (dimension + 1) % 2**32))
+    own = hash_words(seed ^ ((jnp.asarray(dimension).astype(jnp.uint32) + jnp.uint32(1)) * jnp.uint32(0x9E3779B9)))
     shuffled = reverse_bits(_permuted(reverse_bits(index.astype(jnp.uint32)), own))
     first = reverse_bits(_permuted(shuffled, hash_words(own + jnp.uint32(1))))
     second = reverse_bits(_permuted(_pascal(shuffled), hash_words(own + jnp.uint32(2))))

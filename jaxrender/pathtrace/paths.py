@@ -44,7 +44,7 @@ ROULETTE_FROM = 3
 
 
 class Vertex(NamedTuple):
-    """What is done at a vertex; a static argument.
+    """What is done at a vertex; static, but for the number.
 
     Attributes:
       number: 0 is what the eye sees.
@@ -52,7 +52,7 @@ class Vertex(NamedTuple):
       model: of reflection, one of `scatter.MODELS`.
     """
 
-    number: int
+    number: int | Int[Array, ""]
     drawn: int
     scattered: int
     model: str
@@ -141,7 +141,7 @@ def draw_lights(
     return tuple(rays)
 
 
-def _pair(at: Reflector, index: Int[Array, ""], seeds: Words, dimension: int) -> tuple[Scalar, ...]:
+def _pair(at: Reflector, index: Int[Array, ""], seeds: Words, dimension: int | Array) -> tuple[Scalar, ...]:
     """`uniform_pair` in the precision of the vertices."""
     return tuple(x.astype(at.roughness.dtype) for x in uniform_pair(index, seeds, dimension=dimension))
 
@@ -163,9 +163,9 @@ def go_on(at: Reflector, path: Path, seeds: Words, index: Int[Array, ""], *, ver
     scattered = draw(at, u, v, choice, model=vertex.model)
     throughput = path.throughput * scattered.weight
     alive = path.alive & (vec3.largest(throughput) > 0.0)
-    if vertex.number >= ROULETTE_FROM:
-        chance = jnp.clip(vec3.largest(throughput), 0.05, 1.0)
-        alive, throughput = alive & (luck < chance), throughput / chance
+    fades = jnp.asarray(vertex.number) >= ROULETTE_FROM
+    chance = jnp.where(fades, jnp.clip(vec3.largest(throughput), 0.05, 1.0), 1.0)
+    alive, throughput = alive & (luck < chance), throughput / chance
     rays = Rays(offset(at, scattered.wi), scattered.wi)
     return rays, Path(vec3.where(alive, throughput, 0.0), scattered.density, alive, path.shared)
 

@@ -115,7 +115,8 @@ def light_up(
     Only rays that would bring light are traced.
     """
     arrived, unshadowed = np.zeros((2, len(seeds), 3), np.float32)
-    for shadow in _draw_lights(emitters, world.table, at, path, seeds, np.int32(index), vertex=vertex):
+    number, vertex = np.int32(vertex.number), vertex._replace(number=0)
+    for shadow in _draw_lights(emitters, world.table, at, path, seeds, np.int32(index), number, vertex=vertex):
         light = rows(shadow.light)
         unshadowed += light
         tried = np.flatnonzero(light.any(axis=-1))
@@ -187,9 +188,30 @@ def unshadowed_light(
     return jax.lax.fori_loop(0, vertex.drawn, add, Vec3(zero, zero, zero))
 
 
-_draw_lights = jax.jit(paths.draw_lights, static_argnames="vertex")
-scatter = jax.jit(paths.go_on, static_argnames="vertex")
-meet = jax.jit(paths.meet, static_argnames="left")
+def scatter(at: Reflector, path: Path, seeds: Array, index: int, *, vertex: Vertex) -> tuple[Rays, Path]:
+    """`paths.go_on`: one program for all vertices."""
+    number, vertex = np.int32(vertex.number), vertex._replace(number=0)
+    return _go_on(at, path, seeds, np.int32(index), number, vertex=vertex)
+
+
+@functools.partial(jax.jit, static_argnames="vertex")
+def _draw_lights(emitters, table, at, path, seeds, index, number, *, vertex: Vertex):
+    return paths.draw_lights(emitters, table, at, path, seeds, index, vertex=vertex._replace(number=number))
+
+
+@functools.partial(jax.jit, static_argnames="vertex")
+def _go_on(at, path, seeds, index, number, *, vertex: Vertex):
+    return paths.go_on(at, path, seeds, index, vertex=vertex._replace(number=number))
+
+
+def meet(
+    emitters: Emitters, path: Path, direction: Vec3, distance: Array | np.ndarray, surface: HitSurface, *, left: Vertex
+) -> Vec3:
+    """`paths.meet`."""
+    return _meet(emitters, path, direction, distance, surface, left=left._replace(number=0))
+
+
+_meet = jax.jit(paths.meet, static_argnames="left")
 reflected_share = jax.jit(reflectance)
 openness = jax.jit(paths.openness)
 _gather = jax.jit(gather_corners)
