@@ -238,11 +238,12 @@ def test_origins_leave_the_plane_by_more_than_rounding(size, rng):
     origin = rows(offset(at, vec(direction)))
     side = np.sign((direction * normal).sum(1))
     away = ((origin - place) * normal).sum(1) * side
-    # What rounding may move a point: half a unit in the last place of its largest coordinate, along each axis.
-    rounding = np.sqrt(3.0) * 0.5 * np.spacing(np.abs(place).max(1)).astype(np.float64)
+    # What rounding may move a point along the normal: half a unit in the last place of each coordinate.
+    rounding = (0.5 * np.spacing(np.abs(place)).astype(np.float64) * np.abs(normal)).sum(1)
     clear = np.abs((direction * normal).sum(1)) > 1e-6
     assert (away > 4.0 * rounding)[clear].all()
-    assert away.max() < 1e-5 * size + 1e-6
+    # 256 units along each axis, or 1/65536 near 0.
+    assert away.max() < 256.0 * np.spacing(np.float32(size)) * np.sqrt(3.0) + 1.01 / 65536.0
 
 
 def test_rays_leave_on_either_side_of_a_surface():
