@@ -36,6 +36,8 @@ def moved_coordinates(position: Float[Array, "*b"], normal: Float[Array, "*b"]) 
     """`offset_origin` of coordinates one by one, for a normal that is on the side of the new ray."""
     p, n = (jax.lax.stop_gradient(x).astype(jnp.float32) for x in (position, normal))
     steps = (_STEPS * n).astype(jnp.int32)
-    bits = jax.lax.bitcast_convert_type(p, jnp.int32) + jnp.where(p < 0, -steps, steps)
-    moved = jnp.where(jnp.abs(p) < _NEAR_ZERO, p + _STEP_NEAR_ZERO * n, jax.lax.bitcast_convert_type(bits, jnp.float32))
+    near = jnp.abs(p) < _NEAR_ZERO
+    # Steps from a number near 0 may leave the numbers.
+    bits = jax.lax.bitcast_convert_type(jnp.where(near, 1.0, p), jnp.int32) + jnp.where(p < 0, -steps, steps)
+    moved = jnp.where(near, p + _STEP_NEAR_ZERO * n, jax.lax.bitcast_convert_type(bits, jnp.float32))
     return position + (moved - p).astype(position.dtype)
