@@ -20,7 +20,9 @@ def pixel_seeds(pixel: Int[Tensor, "*b"], seed: int | Int[Tensor, ""]) -> Words:
     return _words(_hash(_wide(pixel) ^ _hash(torch.as_tensor(seed).long() & _ALL)))
 
 
-def uniform_pair(index: Int[Tensor, "*b"], seed: Words, *, dimension: int) -> tuple[Float[Tensor, "*b"], ...]:
+def uniform_pair(
+    index: Int[Tensor, "*b"], seed: Words, *, dimension: int | Int[Tensor, ""]
+) -> tuple[Float[Tensor, "*b"], ...]:
     """Point `index` of the sequence of a seed and a pair of dimensions (Burley 2020, sec. 4)."""
     own = _hash(_wide(seed) ^ ((0x9E3779B9 * (dimension + 1)) & _ALL))
     place = _scrambled(_wide(index), own)

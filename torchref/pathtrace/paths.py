@@ -34,7 +34,7 @@ ROULETTE_FROM = 3
 class Vertex(NamedTuple):
     """Its number from the eye, how many lights are drawn and rays scattered there, and the model of reflection."""
 
-    number: int
+    number: int | Int[Tensor, ""]
     drawn: int
     scattered: int
     model: str
