@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxrender import vec3
 from jaxrender.camera import Camera, look_at, project_px
+from jaxrender.machine import num_cores
 from jaxrender.pathtrace import paths
 from jaxrender.pathtrace.emitters import Emitters
 from jaxrender.pathtrace.guide_lookup import guide_lookup
@@ -33,8 +34,8 @@ from jaxrender.pathtrace.scatter import Reflector, draw, make_reflector, reflect
 from jaxrender.pathtrace.world import World
 from jaxrender.vec3 import Vec3
 
-#: Most pixels of a block: what a path holds on to stays in the processor's cache.
-BLOCK = 1 << 14
+#: Most pixels of a block: large enough that programs outweigh what calls them.
+BLOCK = 1 << 16
 
 #: Glossy surfaces below this roughness mirror lamps: scattered rays must look for them, too.
 SMOOTH = 0.3
@@ -44,8 +45,13 @@ _LENS, _OCCLUSION = 1000, 1001
 
 
 def blocks(num_pixels: int) -> tuple[range, int]:
-    """Where the blocks of a picture start, and their size; the last one reaches beyond the last pixel."""
-    size = min(BLOCK, max(256, 1 << max(num_pixels - 1, 0).bit_length()))
+    """Where the blocks of a picture start, and their size, so that each core gets some.
+
+    The last one may reach beyond the last pixel.
+    """
+    size = BLOCK
+    while size > 256 and num_pixels < 2 * num_cores() * size:
+        size //= 2
     return range(0, num_pixels, size), size
 
 
