@@ -11,7 +11,6 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -20,18 +19,15 @@ import mitsuba as mi
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks.path_scenes import DATA, Vector, look, placed, sky, with_edges
 from jaxrender.camera import Camera, camera_rays
 from jaxrender.io import load_scene
-from jaxrender.io.surfaces import on_device
 from jaxrender.scene import MASK, Scene
 from jaxrender.srgb import decode_srgb
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 VARIANT = "llvm_ad_rgb"
 # Newest first. Versions 14 and 15 do not work, and many systems have them beside a newer one.
 _LLVM_LIBRARIES = tuple(f"LLVM-{version}" for version in range(30, 15, -1)) + ("LLVM",)
-
-Vector = tuple[float, float, float]
 
 
 class NoMitsuba(Exception):
@@ -90,7 +86,7 @@ def _cornell() -> View:
     box = dataclasses.replace(box, material=dataclasses.replace(box.material, emissive=1.6 * box.material.emissive))
     shapes = _shapes(box, leave_out=("cbox_smallbox", "cbox_largebox"))
     dragon = load_scene(DATA / "meshes" / "dragon_100k.ply")
-    dragon = _placed(dragon, scale=150.0, turn_radians=0.55, foot=(278.0, 0.0, 340.0))
+    dragon = placed(dragon, scale=150.0, turn_radians=0.55, foot=(278.0, 0.0, 340.0))
     shapes |= _shapes(dragon, color=(0.72, 0.7, 0.62))
     # The angle of the file is that of the shorter side; here the box fills the longer one.
     camera = box.cameras[0]
@@ -100,29 +96,29 @@ def _cornell() -> View:
 
 def _statue() -> View:
     """A bunny before a red wall, lit by a lamp that shines on both, under a dim sky."""
-    bunny = _placed(load_scene(DATA / "meshes" / "bunny.ply"), scale=8.0, turn_radians=-0.3, foot=(0.0, 0.0, 0.0))
+    bunny = placed(load_scene(DATA / "meshes" / "bunny.ply"), scale=8.0, turn_radians=-0.3, foot=(0.0, 0.0, 0.0))
     shapes = _shapes(bunny, color=(0.75, 0.75, 0.75))
     shapes["floor"] = _rectangle((0, 0, 0), (0, 1, 0), (4.0, 4.0), color=(0.6, 0.6, 0.6))
     shapes["wall"] = _rectangle((-1.5, 1.5, 0), (1, 0, 0), (4.0, 1.5), color=(0.7, 0.12, 0.06))
     shapes["screen"] = _rectangle((0, 1.5, -2.0), (0, 0, 1), (4.0, 1.5), color=(0.25, 0.35, 0.6))
     shapes["lamp"] = _rectangle((1.6, 2.6, 1.0), (-0.75, -0.85, -0.35), (0.4, 0.4), radiance=(34.0, 30.0, 25.0))
     shapes["sky"] = _sky((0.16, 0.20, 0.28))
-    return View(_load(shapes), _camera((0.9, 1.15, 3.4), (-0.15, 0.62, 0.0), 38.0))
+    return View(_load(shapes), look((0.9, 1.15, 3.4), (-0.15, 0.62, 0.0), 38.0))
 
 
 def _atrium() -> View:
     """The older Sponza, all grey, under sun and sky."""
-    building = _with_edges(load_scene(DATA / "dabrovic_sponza" / "sponza_dabrovic.ply"))
+    building = with_edges(load_scene(DATA / "dabrovic_sponza" / "sponza_dabrovic.ply"))
     shapes = _shapes(building, color=(0.6, 0.6, 0.6))
     shapes |= {"sky": _sky((2.2, 2.6, 3.2)), "sun": _sun((0.2, -1.0, 0.22), (5.2, 4.7, 3.9))}
-    return View(_load(shapes), _camera((11.0, 1.2, -1.0), (-5.0, 3.2, 0.6), 60.0))
+    return View(_load(shapes), look((11.0, 1.2, -1.0), (-5.0, 3.2, 0.6), 60.0))
 
 
 def _sponza() -> View:
     """Sponza with its textures, under sun and sky."""
     shapes = _shapes(load_scene(DATA / "sponza" / "Sponza.gltf"))
     shapes |= {"sky": _sky((4.5, 5.2, 6.5)), "sun": _sun((0.2, -1.0, 0.22), (18.0, 16.2, 13.5))}
-    return View(_load(shapes), _camera((10.0, 2.0, 0.0), (-5.0, 3.0, 0.0), 60.0), cutouts=True)
+    return View(_load(shapes), look((10.0, 2.0, 0.0), (-5.0, 3.0, 0.0), 60.0), cutouts=True)
 
 
 #: What `build` knows.
@@ -131,39 +127,6 @@ BUILDERS = {"cornell": _cornell, "statue": _statue, "atrium": _atrium, "sponza":
 
 def _load(shapes: Mapping[str, Any]) -> Any:
     return mi.load_dict({"type": "scene", **shapes})
-
-
-def _camera(eye: Vector, target: Vector, fov_y_degrees: float) -> Camera:
-    vectors = [on_device(np.array(vector)) for vector in (eye, target, (0.0, 1.0, 0.0))]
-    return Camera(vectors[0], vectors[1], vectors[2], jnp.float32(np.radians(fov_y_degrees)))
-
-
-def _placed(scene: Scene, *, scale: float, turn_radians: float, foot: Vector) -> Scene:
-    """A statue, turned about the vertical, with the middle of its lowest plane at `foot`."""
-    cos, sin = np.cos(turn_radians), np.sin(turn_radians)
-    rotation = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
-    positions = np.asarray(scene.positions) @ rotation.T * scale
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    positions += foot - np.array([0.5 * (low[0] + high[0]), low[1], 0.5 * (low[2] + high[2])])
-    normals = np.asarray(scene.normals) @ rotation.T
-    return dataclasses.replace(scene, positions=on_device(positions), normals=on_device(normals))
-
-
-def _with_edges(scene: Scene, *, cos_crease: float = 0.7) -> Scene:
-    """The scene with the face's normal at corners where the vertex normal is far from it, as at edges shared by walls.
-
-    A shading normal at right angles to the face would give no tangent frame, and no light.
-    """
-    faces = np.asarray(scene.faces)
-    a, b, c = (np.asarray(scene.positions, np.float64)[faces[:, i]] for i in range(3))
-    flat = np.cross(b - a, c - a)
-    flat = np.repeat(flat / np.linalg.norm(flat, axis=1, keepdims=True), 3, axis=0)
-    corners = faces.ravel()
-    normals = np.asarray(scene.normals, np.float64)[corners]
-    normals = np.where(np.sum(normals * flat, axis=1, keepdims=True) < cos_crease, flat, normals)
-    apart = {name: getattr(scene, name)[corners] for name in ("positions", "tangents", "uv", "colors")}
-    faces = np.arange(len(corners)).reshape(-1, 3)
-    return dataclasses.replace(scene, normals=on_device(normals), faces=on_device(faces), **apart)
 
 
 def _shapes(scene: Scene, *, color: Vector | None = None, leave_out: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -243,11 +206,8 @@ def _rectangle(
 
 
 def _sky(zenith: Vector) -> dict[str, Any]:
-    """The overcast sky of the CIE, three times as bright at the zenith as at the horizon, over black ground."""
-    height = np.sin(np.linspace(0.5 * np.pi, -0.5 * np.pi, 64))
-    rows = np.where(height > 0.0, (1.0 + 2.0 * height) / 3.0, 0.0)
-    texels = np.broadcast_to(rows[:, None, None] * np.asarray(zenith), (64, 128, 3))
-    return {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(texels, np.float32))}
+    """`sky` as an emitter."""
+    return {"type": "envmap", "bitmap": mi.Bitmap(sky(zenith))}
 
 
 def _sun(direction: Vector, irradiance: Vector) -> dict[str, Any]:

@@ -110,7 +110,7 @@ def draw_area(emitters: Emitters, table: SurfaceTable, position: Vec3, pick: Sca
     References:
       Square to triangle: Osada et al., "Shape Distributions", TOG 21(4), 2002, section 4.2.
     """
-    index = jnp.clip(jnp.searchsorted(emitters.area_chance, pick, side="right"), 0, len(emitters.area_triangle) - 1)
+    index = _picked(emitters.area_chance, pick)
     triangle = emitters.area_triangle[index]
     root = jnp.sqrt(u)
     b1, b2 = root * (1.0 - v), root * v
@@ -131,7 +131,7 @@ def draw_area(emitters: Emitters, table: SurfaceTable, position: Vec3, pick: Sca
 
 def draw_light(emitters: Emitters, position: Vec3, pick: Scalar) -> Arriving:
     """One of the lights without extent."""
-    index = jnp.clip(jnp.searchsorted(emitters.light_chance, pick, side="right"), 0, len(emitters.light_chance) - 1)
+    index = _picked(emitters.light_chance, pick)
     chance = emitters.light_chance[index] - jnp.where(index > 0, emitters.light_chance[jnp.maximum(index - 1, 0)], 0.0)
     one = jax.tree.map(lambda values: values[index], emitters.lights)
     wi, radiance = jax.vmap(incoming)(one, vec3.to_array(position))
@@ -154,6 +154,11 @@ def area_density(emitters: Emitters, triangle: Int[Array, " n"], distance: Scala
     """Density per solid angle with which `draw_area` finds the point that a ray hits at some distance."""
     own = emitters.area_density[jnp.maximum(triangle, 0)]
     return jnp.where(triangle >= 0, own * distance * distance / jnp.maximum(jnp.abs(cosine), 1e-6), 0.0)
+
+
+def _picked(chance: Float[Array, " m"], pick: Scalar) -> Int[Array, " n"]:
+    """The first index at which a cumulative probability is above a uniform number."""
+    return jnp.clip(jnp.searchsorted(chance, pick, side="right"), 0, len(chance) - 1)
 
 
 def _mean_emission(table: SurfaceTable, triangle: Int[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:

@@ -5,6 +5,7 @@ Illumination", 2011, section 3, with an answer to soft shadows added (`shadow_ra
 block of pixels, as many at once as there are cores. The same seed gives the same picture.
 """
 
+import dataclasses
 import functools
 from dataclasses import dataclass, field
 
@@ -59,7 +60,7 @@ def render(
       ValueError: if a size or a setting is out of its range.
     """
     settings = settings or TraceSettings()
-    world = scene if isinstance(scene, World) else prepare(scene)
+    world = _opened(scene)
     guides = trace_guides(world, camera, height=height, width=width, settings=settings)
     incident, chosen = filter_incident(guides, settings)
     return combine(world, camera, guides, incident, settings=settings, chosen=chosen)
@@ -69,19 +70,19 @@ def render_direct(
     scene: Scene | World, camera: Camera, *, height: int, width: int, settings: TraceSettings | None = None
 ) -> Float[np.ndarray, "h w 3"]:
     """The direct light of guide rays, unfiltered, with the reflectance in it."""
-    settings = settings or TraceSettings()
-    world = scene if isinstance(scene, World) else prepare(scene)
-    return trace_guides(world, camera, height=height, width=width, settings=settings).direct
+    return trace_guides(_opened(scene), camera, height=height, width=width, settings=settings or TraceSettings()).direct
 
 
 def render_indirect(
     scene: Scene | World, camera: Camera, *, height: int, width: int, settings: TraceSettings | None = None
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3"]]:
     """The indirect light that arrives where guide rays end, unfiltered, over the reflectance; and the reflectance."""
-    settings = settings or TraceSettings()
-    world = scene if isinstance(scene, World) else prepare(scene)
-    guides = trace_guides(world, camera, height=height, width=width, settings=settings)
+    guides = trace_guides(_opened(scene), camera, height=height, width=width, settings=settings or TraceSettings())
     return guides.incident, guides.albedo
+
+
+def _opened(scene: Scene | World) -> World:
+    return scene if isinstance(scene, World) else prepare(scene)
 
 
 def filter_incident(guides: Traced, settings: TraceSettings) -> tuple[np.ndarray, dict[str, float | int | str]]:
@@ -111,8 +112,9 @@ def combine(
     if settings.by_ratio:
         looked_up += _ratios(world, guides, settings)
     images = jnp.asarray(np.concatenate(looked_up, axis=-1)), jnp.asarray(guides.normal), jnp.asarray(guides.depth)
+    filtered = dataclasses.replace(guides, incident=incident)
     starts, size = programs.blocks(height * width)
-    trace = functools.partial(_block, world, camera, guides, images, block=size, settings=settings)
+    trace = functools.partial(_block, world, camera, filtered, images, block=size, settings=settings)
     sums = joined(list(on_all_cores(trace, starts)), height=height, width=width)
     parts = {name: image / spp for name, image in sums.items()}
     image = sum(parts.values(), np.zeros_like(incident))
@@ -136,13 +138,12 @@ def _block(
     world: World, camera: Camera, guides: Traced, images: tuple[Array, Array, Array], start: int, *, block: int,
     settings: TraceSettings,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """Sums over eye rays, for `block` pixels."""
+    """Sums over eye rays, for `block` pixels. `guides` have the filtered incident light."""
     height, width = guides.incident.shape[:2]
     view, spp, model = make_view(camera, height=height), settings.samples_per_pixel, settings.model
     soft, hard = soft_groups(world.emitters), only(world.emitters, SHARP)
-    own = {
-        name: _cut(getattr(guides, name), start, block) for name in ("arrived", "sharp", "met", "emission", "albedo")
-    }
+    names = ("arrived", "sharp", "met", "emission", "albedo", "incident")
+    own = {name: _cut(getattr(guides, name), start, block) for name in names}
     sums = {name: np.zeros((block, 3), np.float32) for name in ("direct", "indirect", "emission")}
     vertex = Vertex(0, settings.light_samples, spp if settings.bounces else 0, model)
     for sample in range(spp):
@@ -150,7 +151,7 @@ def _block(
             # All is known of guide rays already.
             sums["direct"] += sum_of_groups(own["arrived"]) + own["sharp"] + own["met"]
             sums["emission"] += own["emission"]
-            sums["indirect"] += own["albedo"] * _cut(np.asarray(images[0][..., :3]), start, block)
+            sums["indirect"] += own["albedo"] * own["incident"]
             continue
         rays, seeds = programs.eye_rays(view, start, settings.seed, sample, block=block, height=height, width=width)
         at, path, seen = programs.see(world, view, rays, model=model, by_ratio=True)
