@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +17,7 @@ from jaxrender.io.frames import frame_name, numbered_name
 from jaxrender.io.picture import tone_map
 from jaxrender.machine import is_writable_folder, num_cores
 from jaxrender.pathtrace.guide_rays import pooled, trace_guides
-from jaxrender.pathtrace.render import Rendered, combine, filter_incident
+from jaxrender.pathtrace.render import Rendered, combine, filter_incident, render
 from jaxrender.pathtrace.settings import TraceSettings
 from jaxrender.pathtrace.world import World, prepare
 from jaxrender.render_command import open_view
@@ -67,9 +66,7 @@ def _frames(options: "Trace", world: World, camera: Camera, out: Path) -> tuple[
         started = time.perf_counter()
         settings = _settings(options, spp=options.spp, seed=options.seed + frame * options.new_seeds)
         view = orbit(camera, math.radians(options.orbit_degrees) * frame / options.frames)
-        guides = trace_guides(world, view, height=height, width=width, settings=settings)
-        incident, chosen = filter_incident(guides, settings)
-        picture = combine(world, view, guides, incident, settings=settings, chosen=chosen)
+        picture = render(world, view, height=height, width=width, settings=settings)
         seconds.append(time.perf_counter() - started)
         name = out if options.frames == 1 else Path(frame_name(numbered_name(str(out)), frame + 1))
         paths += _write(picture, name, options)
@@ -82,9 +79,8 @@ def _progressive(options: "Trace", world: World, camera: Camera, out: Path) -> t
     width, height = options.size
     assert options.time is not None
     started, spp, guides = time.perf_counter(), 0, None
-    longest = 0.0
-    for count in _doubling():
-        begun = time.perf_counter()
+    while True:
+        begun, count = time.perf_counter(), max(spp, 1)
         # What is traced must serve either way of adding up direct light.
         settings = dataclasses.replace(_settings(options, spp=count, seed=options.seed), direct="ratio")
         more = trace_guides(world, camera, height=height, width=width, settings=settings, first_sample=spp)
@@ -97,19 +93,10 @@ def _progressive(options: "Trace", world: World, camera: Camera, out: Path) -> t
         now = time.perf_counter()
         console.announce(f"{now - started:.1f} s: {_told(picture, spp)}")
         # The first turn compiles; later ones take about twice as long as the one before.
-        longest = now - begun if spp > 1 else 0.0
-        if now - started + 2.0 * longest > options.time:
+        latest = now - begun if spp > 1 else 0.0
+        if now - started + 2.0 * latest > options.time:
             break
     return paths, {"spp": spp, "seconds": time.perf_counter() - started, **picture.chosen}
-
-
-def _doubling() -> Iterator[int]:
-    """1, 1, 2, 4, 8, ...: each as many as all before."""
-    yield 1
-    count = 1
-    while True:
-        yield count
-        count *= 2
 
 
 def orbit(camera: Camera, angle_radians: float) -> Camera:
