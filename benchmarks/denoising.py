@@ -119,15 +119,21 @@ FULL = Sizes()
 QUICK = Sizes(height=96, width=128, scenes=("cornell", "statue"), spp=(1, 4), reference_spp=64, rounds=0, pictures=(1,))
 
 
-def quality(options: Options, sizes: Sizes | None = None) -> Iterator[Measurement]:
-    """All ways in all cells, and a sum of them; nothing, and a word why, if there are no renders."""
-    sizes = sizes or (QUICK if options.quick else FULL)
+def quality(
+    options: Options, sizes: Sizes | None = None, *, load: Callable[..., Renders] | None = None, out: Path = OUT
+) -> Iterator[Measurement]:
+    """All ways in all cells, and a sum of them; nothing, and a word why, if there are no renders.
+
+    Args:
+      load: as `load_renders`, for renders of another origin. out: the folder of pictures.
+    """
+    sizes, load = sizes or (QUICK if options.quick else FULL), load or load_renders
     ways = {name: way for name, way in WAYS.items() if name != "oidn" or has_oidn()}
     rows: list[Measurement] = []
     try:
         for scene in sizes.scenes:
             for spp in sizes.spp:
-                for row in _cell_rows(Cell(_load(scene, spp, sizes)), ways, sizes):
+                for row in _cell_rows(load_cell(scene, spp, sizes, load), ways, sizes, out):
                     rows.append(row)
                     yield row
     except NoRenders as error:
@@ -206,6 +212,12 @@ class Cell:
 
     def _mean_error(self, squares: Sequence[np.ndarray], variance: np.ndarray) -> float:
         return float(np.mean(squares, dtype=np.float64) - np.mean(variance, dtype=np.float64))
+
+
+def load_cell(scene: str, spp: int, sizes: Sizes, load: Callable[..., Renders]) -> Cell:
+    """The renders of all seeds."""
+    options = {"height": sizes.height, "width": sizes.width, "spp": spp, "reference_spp": sizes.reference_spp}
+    return Cell([load(scene, seed=seed, **options) for seed in SEEDS])
 
 
 def shown(image: Color) -> Color:
@@ -381,7 +393,9 @@ def _rival(name: str, light: Image, features: Array, settings: Settings) -> Arra
     return _atrous(light, features, jnp.asarray(sigmas, jnp.float32), int(settings["levels"]))
 
 
-def _cell_rows(cell: Cell, ways: Mapping[str, Callable[[Cell, int], Result]], sizes: Sizes) -> Iterator[Measurement]:
+def _cell_rows(
+    cell: Cell, ways: Mapping[str, Callable[[Cell, int], Result]], sizes: Sizes, out: Path
+) -> Iterator[Measurement]:
     first = cell.first
     height, width = cell.seen.shape
     common = {"scene": first.scene, "spp": first.spp, "height": height, "width": width}
@@ -395,12 +409,7 @@ def _cell_rows(cell: Cell, ways: Mapping[str, Callable[[Cell, int], Result]], si
         yield Measurement("quality", name, metrics, {**common, "settings": _told(settings)})
     if first.spp in sizes.pictures:
         strip = {"reference": cell.reference, **dict(panels[name] for name in PANELS if name in panels)}
-        draw_strip(cell, strip, OUT / f"{first.scene}_{width}x{height}_{first.spp}.png")
-
-
-def _load(scene: str, spp: int, sizes: Sizes) -> list[Renders]:
-    load = functools.partial(load_renders, scene, height=sizes.height, width=sizes.width, spp=spp)
-    return [load(seed=seed, reference_spp=sizes.reference_spp) for seed in SEEDS]
+        draw_strip(cell, strip, out / f"{first.scene}_{width}x{height}_{first.spp}.png")
 
 
 def _told(settings: Mapping[str, Any]) -> str:

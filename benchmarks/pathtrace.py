@@ -7,39 +7,29 @@ On one thread per block of pixels, as the command runs. Scenes are those of `pat
 - `mitsuba`: direct light and two bounces for one sample a pixel, traced by both libraries in turns; one light of each
   kind for ours, one light of all for Mitsuba. `time_ratio` is Mitsuba's time over ours.
 - `rays`: 131,072 rays through Sponza, one thread: Embree, and the tree in pure JAX.
-- `quality`: indirect light of 1, 4 and 16 paths at 512 x 384, filtered in four ways, MSE on 0..255 display-encoded with
-  converged direct light added, against 1024 paths of another seed. `bilateral` and `atrous` have the best of some
-  radii for each cell, found with the reference; `guided` goes by its rule.
-- `final`: the whole picture with direct light plain and by ratio, against 1024 samples: direct, indirect and total.
+- `quality`, `final`, `figures`: see `path_quality`.
 """
 
 import dataclasses
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
-from benchmarks.path_scenes import DATA, STAGES, Stage
+from benchmarks.path_quality import figures, final, quality
+from benchmarks.path_renders import open_stage
+from benchmarks.path_scenes import DATA
 from benchmarks.suites import Measurement, Options
 from benchmarks.timing import measure_alternating
 from jaxrender import console
 from jaxrender.camera import camera_rays
-from jaxrender.pathtrace import Bvh, EmbreeScene, TraceSettings, World, build_bvh, prepare, render, trace_rays
+from jaxrender.pathtrace import Bvh, EmbreeScene, TraceSettings, World, build_bvh, render, trace_rays
 from jaxrender.pathtrace.guide_rays import trace_guides
 from jaxrender.pathtrace.ray_scene import RayScene
-from jaxrender.pathtrace.render import Rendered, filter_incident
-from jaxrender.srgb import encode_srgb
 
-FOLDER = Path("out") / "pathtrace"
-RADII = {"bilateral": (4, 8, 16, 24), "atrous": (4, 8, 16, 32)}
-
-Image = Float[np.ndarray, "h w 3"]
 Params = dict[str, str | int | float | bool]
 
 
@@ -50,18 +40,18 @@ class Sizes:
     scenes: tuple[str, ...] = ("cornell", "statue", "atrium", "sponza")
     table: tuple[int, int] = (768, 1024)
     table_rows: tuple[tuple[int, int], ...] = ((1, 1), (1, 4), (2, 4))
-    quality: tuple[int, int] = (384, 512)
-    reference_spp: int = 1024
-    spp: tuple[int, ...] = (1, 4, 16)
     num_rays: int = 1 << 17
     min_runs: int = 3
 
 
 FULL = Sizes()
 QUICK = Sizes(
-    scenes=("cornell",), table=(48, 64), table_rows=((1, 1),), quality=(48, 64), reference_spp=16, spp=(1,),
-    num_rays=1 << 12, min_runs=1,
-)  # fmt: skip
+    scenes=("cornell",),
+    table=(48, 64),
+    table_rows=((1, 1),),
+    num_rays=1 << 12,
+    min_runs=1,
+)
 
 
 def run(options: Options) -> Iterator[Measurement]:
@@ -73,12 +63,9 @@ def run(options: Options) -> Iterator[Measurement]:
     for name, case in CASES.items():
         if options.wants(name):
             yield from case(sizes, options)
-
-
-@functools.lru_cache(maxsize=1)
-def _open(name: str) -> tuple[Stage, World]:
-    stage = STAGES[name]()
-    return stage, prepare(stage.scene, environment=stage.environment)
+    for name, judge in QUALITY.items():
+        if options.wants(name):
+            yield from judge(options)
 
 
 class _Counted(RayScene):
@@ -99,7 +86,7 @@ class _Counted(RayScene):
 def _table1(sizes: Sizes, options: Options) -> Iterator[Measurement]:
     height, width = sizes.table
     for name in sizes.scenes:
-        stage, world = _open(name)
+        stage, world = open_stage(name)
         for bounces, spp in sizes.table_rows:
             settings = TraceSettings(bounces=bounces, samples_per_pixel=spp, model="lambert", seed=options.seed)
 
@@ -140,7 +127,7 @@ def _mitsuba(sizes: Sizes, options: Options) -> Iterator[Measurement]:
         return
     height, width = sizes.table
     for name in sizes.scenes:
-        stage, world = _open(name)
+        stage, world = open_stage(name)
         view = theirs.build(name)
         settings = TraceSettings(
             bounces=2, model="lambert", ao_rays=0, direct="plain", method="none", seed=options.seed
@@ -164,7 +151,7 @@ def _mitsuba(sizes: Sizes, options: Options) -> Iterator[Measurement]:
 
 def _rays(sizes: Sizes, options: Options) -> Iterator[Measurement]:
     """Primary rays, cosine-free random ones from where those end, and the same as shadow rays."""
-    stage, _ = _open("sponza" if "sponza" in sizes.scenes else sizes.scenes[0])
+    stage, _ = open_stage("sponza" if "sponza" in sizes.scenes else sizes.scenes[0])
     side = int(sizes.num_rays**0.5)
     origins, directions = (
         np.ascontiguousarray(np.asarray(x).reshape(-1, 3)) for x in camera_rays(stage.camera, height=side, width=side)
@@ -195,78 +182,5 @@ def _ask(backend: EmbreeScene | Bvh, rays: tuple[np.ndarray, np.ndarray], query:
     jax.block_until_ready(trace_rays(backend, *rays, query=query))
 
 
-def _reference(name: str, sizes: Sizes) -> Rendered:
-    """`reference_spp` samples of the whole picture, kept in `FOLDER`."""
-    stage, world = _open(name)
-    height, width = sizes.quality
-    file = FOLDER / f"{name}_{width}x{height}_{sizes.reference_spp}.npz"
-    names = ("image", "direct", "indirect", "emission", "incident")
-    if not file.is_file():
-        console.announce(f"pathtrace: {name}, reference of {sizes.reference_spp} samples")
-        settings = TraceSettings(samples_per_pixel=sizes.reference_spp, method="none", model="lambert", seed=977)
-        found = render(world, stage.camera, height=height, width=width, settings=settings)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(file, **{name: getattr(found, name) for name in names})
-    with np.load(file) as stored:
-        return Rendered(**{name: stored[name] for name in names}, guides=None)  # type: ignore[arg-type]
-
-
-def _mse(image: Image, reference: Image) -> float:
-    """On 0..255, clamped and display-encoded."""
-    a, b = (255.0 * np.asarray(encode_srgb(jnp.clip(jnp.asarray(x), 0.0, 1.0))) for x in (image, reference))
-    return float(np.mean((a - b) ** 2))
-
-
-def _quality(sizes: Sizes, options: Options) -> Iterator[Measurement]:
-    height, width = sizes.quality
-    for name in sizes.scenes:
-        stage, world = _open(name)
-        truth = _reference(name, sizes)
-        for spp in sizes.spp:
-            settings = TraceSettings(samples_per_pixel=spp, model="lambert", seed=options.seed)
-            guides = trace_guides(world, stage.camera, height=height, width=width, settings=settings)
-
-            def judged(incident, guides=guides, truth=truth):
-                over = guides.albedo
-                rest = truth.direct + truth.emission
-                return _mse(incident * over + rest, truth.incident * over + rest)
-
-            params: Params = {
-                "scene": name,
-                "spp": spp,
-                "height": height,
-                "width": width,
-                "reference_spp": sizes.reference_spp,
-            }
-            yield Measurement("quality", "unfiltered", {"mse_255": judged(guides.incident)}, params)
-            incident, chosen = filter_incident(guides, settings)
-            yield Measurement(
-                "quality", "guided", {"mse_255": judged(incident)}, {**params, "radius": chosen["radius"]}
-            )
-            for method, radii in RADII.items():
-                tried = {
-                    radius: judged(
-                        filter_incident(guides, dataclasses.replace(settings, method=method, radius=radius))[0]
-                    )
-                    for radius in radii
-                }
-                best = min(tried, key=tried.__getitem__)
-                yield Measurement("quality", method, {"mse_255": tried[best]}, {**params, "radius": best})
-
-
-def _final(sizes: Sizes, options: Options) -> Iterator[Measurement]:
-    height, width = sizes.quality
-    for name in sizes.scenes:
-        stage, world = _open(name)
-        truth = _reference(name, sizes)
-        for spp in sizes.spp:
-            for direct in ("plain", "ratio"):
-                settings = TraceSettings(samples_per_pixel=spp, model="lambert", seed=options.seed, direct=direct)
-                found = render(world, stage.camera, height=height, width=width, settings=settings)
-                metrics = {f"mse_255_{part}": _mse(getattr(found, part), getattr(truth, part))
-                           for part in ("direct", "indirect")}  # fmt: skip
-                params: Params = {"scene": name, "spp": spp, "height": height, "width": width}
-                yield Measurement("final", direct, {**metrics, "mse_255": _mse(found.image, truth.image)}, params)
-
-
-CASES = {"table1": _table1, "mitsuba": _mitsuba, "rays": _rays, "quality": _quality, "final": _final}
+CASES = {"table1": _table1, "mitsuba": _mitsuba, "rays": _rays}
+QUALITY = {"quality": quality, "final": final, "figures": figures}
