@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from jaxrender.checks import bad_input
-from jaxrender.deferred.pipeline import render_scene
 from jaxrender.filters.aovs import Aovs
 from jaxrender.io.aovs import (
     LayeredFile,
@@ -22,7 +21,9 @@ from jaxrender.io.aovs import (
 from jaxrender.io.builtin_scene import builtin_scene
 from jaxrender.io.exr import exr_attributes, read_exr_header
 from jaxrender.io.layer_names import AovNames
-from jaxrender.render_command import picture_layers
+from jaxrender.pathtrace.guide_rays import Traced, trace_guides
+from jaxrender.pathtrace.settings import TraceSettings
+from jaxrender.pathtrace.world import prepare
 from jaxrender.scene import whole_scene_camera
 
 #: Images that tell where edges are; one of them there must be.
@@ -32,8 +33,8 @@ LIGHT = ("direct", "indirect", "emission")
 
 _BESIDE = (*GUIDES, "albedo", "ao")
 
-#: Samples a pixel that the noise of the built-in picture stands for, and its seed.
-BUILTIN_SAMPLES, BUILTIN_SEED = 4, 0
+#: Samples a pixel of the built-in picture.
+BUILTIN_SAMPLES = 4
 
 
 @dataclass(frozen=True)
@@ -171,30 +172,23 @@ def _channels(file: LayeredFile, *, without: str) -> dict[str, Num[np.ndarray, "
 
 
 def builtin_inputs(*, height: int, width: int) -> DenoiseInputs:
-    """A noisy picture of the built-in scene with its G-buffer: each pixel's light times random numbers of mean 1.
-
-    They are spread as a mean of `BUILTIN_SAMPLES` of paths would be, most of them dark; one pixel in 5000 is a firefly.
-    """
-    layers = draw_builtin(height=height, width=width)
-    image, alpha = layers[""][..., :3], layers[""][..., 3:]
-    rng = np.random.default_rng(BUILTIN_SEED)
-    shape = 0.5 * BUILTIN_SAMPLES
-    gain = rng.gamma(shape, 1.0 / shape, (height, width, 1)) * rng.gamma(20.0, 1.0 / 20.0, (height, width, 3))
-    gain *= np.where(rng.random((height, width, 1)) < 1.0 / 5000.0, 60.0, 1.0)
+    """A picture of the built-in scene of `BUILTIN_SAMPLES` paths a pixel, all light in one, with its guides."""
+    found = trace_builtin(height=height, width=width)
     aovs = Aovs(
-        color=(image * alpha * gain).astype(np.float32),
-        **{name: np.asarray(layers[name], np.float32) for name in ("albedo", "normal", "depth", "position")},
-    )
+        color=found.color, albedo=found.albedo, normal=found.normal, depth=found.depth, position=found.position,
+        ao=found.ao,
+    )  # fmt: skip
     aovs.check()
     return DenoiseInputs(
-        "the built-in picture", aovs, alpha=alpha, sources={name: "drawn here" for name in aovs.given()},
+        "the built-in picture", aovs, sources={name: "traced here" for name in aovs.given()},
         samples_per_pixel=float(BUILTIN_SAMPLES),
     )  # fmt: skip
 
 
-def draw_builtin(*, height: int, width: int) -> dict[str, Num[np.ndarray, "h w c"]]:
-    """The built-in scene from nearby, and its G-buffer, as layers."""
+def trace_builtin(*, height: int, width: int) -> Traced:
+    """The built-in scene from nearby, under a sun and a sky; direct light is of as many samples as indirect."""
     scene = builtin_scene()
     camera = whole_scene_camera(scene, aspect=width / height)
     camera = replace(camera, fov_y_radians=0.65 * camera.fov_y_radians)
-    return picture_layers(render_scene(scene, camera, height=height, width=width))
+    settings = TraceSettings(samples_per_pixel=BUILTIN_SAMPLES, direct="ratio")
+    return trace_guides(prepare(scene), camera, height=height, width=width, settings=settings)
