@@ -17,12 +17,17 @@ from jaxrender.vec3 import Scalar, Vec3, dot, normalize, reflect
 
 MODELS = ("metallic_roughness", "phong", "lambert")
 
+#: Normals for shading are turned towards the eye until their cosine to it is at least this: at silhouettes they may
+#: face away, and a surface that is seen would be black.
+LEAST_COSINE = 0.01
+
 
 class Reflector(NamedTuple):
     """A point of a surface, as light sees it.
 
     Attributes:
-      normal: for shading; geometric_normal: of the triangle; both unit and on the side of wo.
+      normal: for shading; geometric_normal: of the triangle; both unit and on the side of wo (but for `normal` of the
+        model "lambert", which does without).
       wo: unit, towards where the path comes from.
       diffuse: reflectance of the matt part. mirror: F0 of the glossy part, 0 for a model without.
       roughness: perceptual, alpha its square.
@@ -60,6 +65,8 @@ def make_reflector(surface: HitSurface, direction: Vec3, *, model: str) -> Refle
     diffuse, mirror = base, base * 0.0
     if model != "lambert":
         diffuse, mirror = base * (1.0 - metallic), base * metallic + 0.04 * (1.0 - metallic)
+        away = jnp.where(surface.triangle >= 0, LEAST_COSINE - dot(normal, wo), 0.0)
+        normal = normalize(normal + wo * jnp.maximum(away, 0.0))
     fresnel = mirror
     if model == "metallic_roughness":
         grazing = jnp.clip(1.0 - dot(normal, wo), 0.0, 1.0) ** 5

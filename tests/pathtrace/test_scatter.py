@@ -159,8 +159,9 @@ def test_reciprocity(model, rng, x64):
 @pytest.mark.parametrize("model", MODELS)
 def test_no_light_from_below_the_horizon_or_through_the_triangle(model, rng):
     fields, wi = bent(rng, 4000)
-    below = ((wi * fields["normal"]).sum(1) <= 0.0) | ((wi * fields["geometric_normal"]).sum(1) <= 0.0)
     at = make(fields, model)
+    fields["normal"] = rows(at.normal)  # turned to the eye where it faces away
+    below = ((wi * fields["normal"]).sum(1) <= 0.0) | ((wi * fields["geometric_normal"]).sum(1) <= 0.0)
     f = rows(EVALUATE(at, vec(wi), model=model))
     assert below.sum() > 1000 and (f[below] == 0.0).all()
     seen = ~below & ((fields["wo"] * fields["normal"]).sum(1) > 0.0)
@@ -174,6 +175,8 @@ def test_no_light_from_below_the_horizon_or_through_the_triangle(model, rng):
 @pytest.mark.parametrize("model", MODELS)
 def test_values_are_those_of_brdf(model, rng, x64):
     fields, wi = bent(rng, 500)
+    at = make(fields, model)
+    fields["normal"] = rows(at.normal)  # turned to the eye where it faces away
     n, wo, base = (jnp.asarray(fields[name]) for name in ("normal", "wo", "base_color"))
     metallic, roughness = (jnp.asarray(fields[name])[:, None] for name in ("metallic", "roughness"))
     crosses = (wi * fields["geometric_normal"]).sum(1, keepdims=True) > 0.0
@@ -187,7 +190,7 @@ def test_values_are_those_of_brdf(model, rng, x64):
         )
     else:
         f = brdf.lambert(base)
-    got = rows(evaluate(make(fields, model), vec(wi), model=model))
+    got = rows(evaluate(at, vec(wi), model=model))
     np.testing.assert_allclose(got, np.asarray(f) * cosine, rtol=1e-9, atol=1e-14)
 
 
@@ -278,3 +281,18 @@ def test_gradients_stay_finite_at_the_edges(model):
         for edge in (0.0, 1.0):
             found = slope((jnp.full(4, edge), jnp.full(4, edge), jnp.full(4, edge)))
             assert all(np.isfinite(np.asarray(x)).all() for x in found), (wi, edge)
+
+
+@pytest.mark.parametrize("model", ["metallic_roughness", "phong"])
+@pytest.mark.parametrize("cosine", [-0.6, -0.1, 0.0, 0.005])
+def test_normals_that_face_away_at_silhouettes_are_turned_to_the_eye(model, cosine):
+    """Else the surface there, which is seen, would reflect nothing: black dots along outlines."""
+    fields, _ = point(cosine, base=(0.5, 0.4, 0.6), metallic=0.3, roughness=0.5)
+    at, wo = make(fields, model), fields["wo"][0]
+    normal = rows(at.normal)[0]
+    np.testing.assert_allclose(np.linalg.norm(normal), 1.0, atol=1e-6)
+    assert 0.0099 < normal @ wo < 0.0127 and normal @ fields["normal"][0] > 0.75
+    # turned in the plane of both, and no further than needed
+    assert abs(np.linalg.det([normal, wo, fields["normal"][0]])) < 1e-6
+    unturned = make(point(0.2, base=(0.5, 0.4, 0.6), metallic=0.3, roughness=0.5)[0], model)
+    np.testing.assert_allclose(rows(unturned.normal)[0], fields["normal"][0], atol=1e-6)

@@ -43,16 +43,23 @@ def make_reflector(surface: HitSurface, direction: Vec3, *, model: str) -> Refle
     base, metallic = to_array(surface.base_color), surface.metallic[..., None]
     wo = -to_array(direction)
     diffuse, mirror = (1.0 - metallic) * base, (1.0 - metallic) * 0.04 + metallic * base
+    normal = to_array(surface.normal)
     if model == "lambert":
         diffuse, mirror = base, torch.zeros_like(base)
-    schlick = (1.0 - dot(to_array(surface.normal), wo)).clamp(0.0, 1.0) ** 5
+    else:
+        # The part along wo becomes 0.01 where it was less; the part across it stays.
+        along = dot(normal, wo)
+        bent = torch.where(along < 0.01, normal - along * wo + 0.01 * wo, normal)
+        bent = bent / torch.linalg.vector_norm(bent, dim=-1, keepdim=True)
+        normal = torch.where(surface.triangle[..., None] >= 0, bent, normal)
+    schlick = (1.0 - dot(normal, wo)).clamp(0.0, 1.0) ** 5
     given_back = mirror + (1.0 - mirror) * schlick if model == "metallic_roughness" else mirror
     matt, glossy = diffuse.mean(-1), given_back.mean(-1)
     share = (matt / torch.where(matt + glossy > 0.0, matt + glossy, 1.0)).clamp(0.1, 0.9)
     share = torch.where(matt > 0.0, share, 0.0)
     share = torch.where(glossy > 0.0, share, 1.0)
     return Reflector(
-        surface.position, surface.normal, surface.geometric_normal, from_array(wo), from_array(diffuse),
+        surface.position, from_array(normal), surface.geometric_normal, from_array(wo), from_array(diffuse),
         from_array(mirror), surface.roughness, share,
     )  # fmt: skip
 
