@@ -42,6 +42,7 @@ class Traced:
       albedo: reflectance (`scatter.reflectance`).
       normal, position, depth: of the surface; depth is linear view depth.
       ao: ambient occlusion for each of `AO_RADII`, 1 for open.
+      sharpness: of reflections (`sharpness.sharpness`).
     """
 
     arrived: Float[np.ndarray, "h w 3k"]
@@ -58,6 +59,7 @@ class Traced:
     position: Float[np.ndarray, "h w 3"]
     depth: Float[np.ndarray, "h w 1"]
     ao: Float[np.ndarray, "h w k"]
+    sharpness: Float[np.ndarray, "h w 1"]
 
     @property
     def direct(self) -> Float[np.ndarray, "h w 3"]:
@@ -105,7 +107,7 @@ def pooled(first: Traced, second: Traced, *, counts: tuple[int, int]) -> Traced:
     means["variance"] = squares / (total * (total - 1))
     if n == m == 1:
         means["even"], means["odd"] = first.incident, second.incident
-    same = ("emission", "albedo", "normal", "position", "depth")
+    same = ("emission", "albedo", "normal", "position", "depth", "sharpness")
     return Traced(**means | {name: getattr(first, name) for name in same})
 
 

@@ -31,6 +31,7 @@ from jaxrender.pathtrace.hits import Hits
 from jaxrender.pathtrace.low_discrepancy import pixel_seeds, uniform_pair
 from jaxrender.pathtrace.paths import Path, Rays, Vertex
 from jaxrender.pathtrace.scatter import Reflector, draw, make_reflector, reflectance
+from jaxrender.pathtrace.sharpness import sharpness
 from jaxrender.pathtrace.world import World
 from jaxrender.vec3 import Vec3
 
@@ -95,7 +96,8 @@ def see(
     seen = (hits.triangle >= 0)[:, None]
     position = rows(at.position)
     depth = ((np.asarray(view.eye) - position) @ np.asarray(view.backward))[:, None]
-    images = {"albedo": rows(reflected_share(at)), "normal": rows(at.normal), "position": position, "depth": depth}
+    images = {"albedo": rows(reflected_share(at)), "normal": rows(at.normal), "position": position, "depth": depth,
+              "sharpness": np.asarray(_sharpness(at))[:, None]}  # fmt: skip
     images = {name: np.where(seen, image, np.float32(0.0)) for name, image in images.items()}
     return at, path, images | {"emission": rows(emission)}
 
@@ -220,6 +222,7 @@ def meet(
 _meet = jax.jit(paths.meet, static_argnames="left")
 reflected_share = jax.jit(reflectance)
 openness = jax.jit(paths.openness)
+_sharpness = jax.jit(sharpness)
 _gather = jax.jit(gather_corners)
 _interpolate = jax.jit(interpolate)
 _texels = jax.jit(look_up_texels, static_argnames="fine")

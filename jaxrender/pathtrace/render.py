@@ -9,6 +9,7 @@ import dataclasses
 import functools
 from dataclasses import dataclass, field
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -26,8 +27,12 @@ from jaxrender.pathtrace.paths import Vertex
 from jaxrender.pathtrace.programs import light_up, make_view, rows, unshadowed_light
 from jaxrender.pathtrace.settings import TraceSettings
 from jaxrender.pathtrace.shadow_ratio import UNSHADOWED, filtered_ratio, ratio_radius
+from jaxrender.pathtrace.sharpness import blend_windows, window_radii
 from jaxrender.pathtrace.world import World, prepare
 from jaxrender.scene import Scene
+
+# Radii that are wanted this near below one are not worth another.
+_NEAR = 0.5
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,10 @@ def _opened(scene: Scene | World) -> World:
 
 
 def filter_incident(guides: Traced, settings: TraceSettings) -> tuple[np.ndarray, dict[str, float | int | str]]:
-    """The indirect light of guide rays, filtered by normals, depths and ambient occlusion; and the settings."""
+    """The indirect light of guide rays, filtered by normals, depths and ambient occlusion; and the settings.
+
+    Where surfaces mirror, windows are narrower, unless a radius is set (`sharpness`).
+    """
     if settings.method == "none" or settings.bounces == 0 or not guides.normal.any():
         return guides.incident, {"method": "none"}
     aovs = Aovs(
@@ -98,7 +106,17 @@ def filter_incident(guides: Traced, settings: TraceSettings) -> tuple[np.ndarray
         samples_per_pixel=settings.samples_per_pixel,
     )  # fmt: skip
     found = denoise(aovs, settings=chosen)
-    return found.layers["indirect"], found.chosen
+    light, largest = found.layers["indirect"], int(found.chosen["radius"])
+    wanted = largest * (1.0 - guides.sharpness)
+    radii = window_radii(largest, float(wanted.min()) + _NEAR)
+    if settings.radius is None and len(radii) > 1:
+        chosen = dataclasses.replace(chosen, eps=float(found.chosen["eps"]))
+        narrower = [
+            denoise(aovs, settings=dataclasses.replace(chosen, radius=radius)).layers["indirect"]
+            if radius else guides.incident for radius in radii[1:]
+        ]  # fmt: skip
+        light = np.asarray(_blend(np.stack([light, *narrower]), np.asarray(radii, np.float32), wanted))
+    return light, found.chosen
 
 
 def combine(
@@ -170,6 +188,9 @@ def _block(
             whole = rows(unshadowed_light(emitters, world.table, at, path, seeds, np.int32(sample), vertex=many))
             sums["direct"] += whole * found[:, 6 + 3 * group : 9 + 3 * group]
     return sums
+
+
+_blend = jax.jit(blend_windows)
 
 
 def _cut(image: Float[np.ndarray, "h w c"], start: int, count: int) -> np.ndarray:

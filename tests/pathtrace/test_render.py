@@ -9,6 +9,7 @@ import pytest
 from jaxrender.camera import Camera
 from jaxrender.pathtrace import TraceSettings, move, prepare, render, render_direct, render_indirect
 from jaxrender.pathtrace.guide_rays import pooled, trace_guides
+from jaxrender.pathtrace.render import filter_incident
 from jaxrender.scene import DIRECTIONAL, MASK, POINT, SPOT, SceneImage
 from tests.support.rooms import light, matt, polygon_irradiance, room, sphere, square
 
@@ -206,6 +207,32 @@ def test_a_smooth_mirror_shows_the_lamp_either_way():
     np.testing.assert_allclose(means["ratio"].mean(), means["plain"].mean(), rtol=0.02)
     # Neither is a mess of spikes: the image of the lamp, at most as bright as the lamp.
     assert all(image.max() < 4.5 for image in means.values())
+
+
+def test_reflections_in_metal_survive_the_filter():
+    """A polished floor before striped walls: narrow windows where it mirrors, unless a radius is set."""
+    stripes = np.zeros((8, 8, 3), np.uint8)
+    stripes[:, ::2] = 230
+    paint = matt((1.0, 1.0, 1.0), base_color_texture=0)
+    wall = square((0.0, 1.0, -2.0), (3, 0, 0), (0, 1, 0), paint)
+    metal = square((0, 0, 0), (3, 0, 0), (0, 0, -3), matt((0.9, 0.9, 0.9), metallic=1.0, roughness=0.05))
+    image = SceneImage("stripes", stripes, ("repeat", "repeat"), True)
+    sun = light(DIRECTIONAL, direction=(0.0, -0.3, -1.0), intensity=(3.0, 3.0, 3.0))
+    world = prepare(room(metal, wall, lights=sun, images=(image,)))
+    eye = camera((0.0, 1.0, 3.0), (0.0, 0.0, 0.0))
+    settings = TraceSettings(samples_per_pixel=4, bounces=1, ao_rays=0)
+    guides = trace_guides(world, eye, settings=settings, **SIZE)
+    truth = trace_guides(world, eye, settings=dataclasses.replace(settings, samples_per_pixel=64, seed=3), **SIZE)
+    mirrors = guides.sharpness[..., 0] > 0.9
+    assert mirrors.sum() > 100 and guides.incident[mirrors].std() > 0.1
+    matt_everywhere = dataclasses.replace(guides, sharpness=np.zeros_like(guides.sharpness))
+    errors = [
+        np.mean((filter_incident(one, settings)[0] - truth.incident)[mirrors] ** 2) for one in (guides, matt_everywhere)
+    ]
+    assert errors[0] < 0.2 * errors[1]
+    set_radius = dataclasses.replace(settings, radius=2)
+    given = [filter_incident(one, set_radius)[0] for one in (guides, matt_everywhere)]
+    np.testing.assert_array_equal(*given)
 
 
 def test_holes_let_light_through():

@@ -1844,6 +1844,21 @@ def _paths() -> list[Case]:
     ]
 
 
+def _sharpness() -> list[Case]:
+    room, n = "pathtrace.sharpness", 40
+    levels, radii = {"levels": _uniform(0.0, 1.0, 4, 5, 6, 3)}, {"radii": np.array([9.0, 2.0, 1.0, 0.0])}
+    return [
+        Case(f"{room}.sharpness", {"at": _reflector_record(n)}),
+        *(
+            Case(f"{room}.window_radii", {"largest": r, "least": least}, f"{r} to {least}", host=True)
+            for r, least in ((16, 0.0), (10, 1.0), (7, 0.4), (3, 3.0))
+        ),
+        Case(
+            f"{room}.blend_windows", {**levels, **radii, "wanted": _uniform(0.0, 12.0, 5, 6, 1)}, gradients=("levels",)
+        ),
+    ]
+
+
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
@@ -1851,6 +1866,7 @@ CASES: tuple[Case, ...] = tuple(
         _pose_model, _skeleton, _skinning, _camera, _metrics, _scene, _texture, _quads, _warps, _brdf,
         _whole_scene, _deferred_shading, _late, _box_filters, _guided_filter, _pair_filters, _denoising, _rays,
         _three_vectors, _sequences, _surroundings, _lookups, _scattering, _hit_points, _emitters, _paths,
+        _sharpness,
     )
     for case in room()
 )  # fmt: skip
