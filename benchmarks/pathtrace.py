@@ -12,6 +12,7 @@ On one thread per block of pixels, as the command runs. Scenes are those of `pat
 
 import dataclasses
 import functools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -69,18 +70,21 @@ def run(options: Options) -> Iterator[Measurement]:
 
 
 class _Counted(RayScene):
-    """Rays of a world that count how many were asked for."""
+    """Rays of a world that count how many were traced."""
 
     def __init__(self, rays: RayScene):
         self._rays, self.count = rays, 0
 
-    def closest(self, origins, directions):
-        self.count += len(origins)
-        return self._rays.closest(origins, directions)
+    def closest(self, rays, wanted, *, reach=math.inf):
+        self.count += int(np.sum(np.asarray(wanted)))
+        return self._rays.closest(rays, wanted, reach=reach)
 
-    def blocked(self, origins, directions, distance):
-        self.count += len(origins)
-        return self._rays.blocked(origins, directions, distance)
+    def blocked(self, shadow):
+        self.count += int(np.any(np.asarray(shadow.light), axis=0).sum())
+        return self._rays.blocked(shadow)
+
+    def moved(self, scene, table):
+        return _Counted(self._rays.moved(scene, table))
 
 
 def _table1(sizes: Sizes, options: Options) -> Iterator[Measurement]:

@@ -81,20 +81,11 @@ def make_emitters(
       environment: radiance from far away (`make_environment`).
     """
     lights = scene.lights if lights is None else lights
-    faces, material = np.asarray(scene.faces), np.asarray(scene.material_id)
-    p = np.asarray(scene.positions, np.float64)[faces]
-    area = 0.5 * np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
-    glows = (np.asarray(scene.material.emissive)[material] > 0.0).any(axis=1) & (area > 0.0)
-    triangle = np.flatnonzero(glows).astype(np.int32)
-    power = area[triangle] * _mean_emission(table, triangle)
-    triangle, power = triangle[power > 0.0], power[power > 0.0]
-    density = np.zeros(len(faces), np.float32)
-    chance = _cumulative(power)
-    density[triangle] = np.diff(chance, prepend=np.float32(0.0)) / area[triangle]
+    triangle, area, corners, power = _shining(scene, table)
+    chance, density = _cumulative(power), np.zeros(len(scene.faces), np.float32)
+    density[triangle] = np.diff(chance, prepend=np.float32(0.0)) / area
     far = None if environment is None or not np.any(environment) else make_environment(environment)
     present = {"area": len(triangle), "lights": len(lights.kind), "environment": far is not None}
-    a, b, c = (p[triangle, k] for k in range(3))
-    corners = np.concatenate([a, b - a, c - a, np.asarray(scene.material.emissive)[material[triangle]]], axis=1)
     return Emitters(
         area_triangle=jnp.asarray(triangle), area_chance=jnp.asarray(chance), area_density=jnp.asarray(density),
         area_corners=jnp.asarray(corners, jnp.float32),
@@ -102,6 +93,20 @@ def make_emitters(
         light_chance=jnp.asarray(_cumulative(_light_power(lights))), environment=far,
         groups=tuple(name for name, some in present.items() if some),
     )  # fmt: skip
+
+
+def _shining(scene: Scene, table: SurfaceTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The triangles that emit: numbers, areas, `Emitters.area_corners`, and powers."""
+    faces, material = np.asarray(scene.faces), np.asarray(scene.material_id)
+    emissive = np.asarray(scene.material.emissive)
+    p = np.asarray(scene.positions, np.float64)[faces]
+    area = 0.5 * np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
+    triangle = np.flatnonzero((emissive[material] > 0.0).any(axis=1) & (area > 0.0)).astype(np.int32)
+    power = area[triangle] * _mean_emission(table, triangle)
+    triangle, power = triangle[power > 0.0], power[power > 0.0]
+    a, b, c = (p[triangle, k] for k in range(3))
+    corners = np.concatenate([a, b - a, c - a, emissive[material[triangle]]], axis=1)
+    return triangle, area[triangle], corners, power
 
 
 def draw_area(emitters: Emitters, table: SurfaceTable, position: Vec3, pick: Scalar, u: Scalar, v: Scalar) -> Arriving:

@@ -2,22 +2,24 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jax import Array
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from jaxrender import checks
+from jaxrender import checks, vec3
 from jaxrender.camera import Camera
-from jaxrender.machine import on_all_cores
 from jaxrender.pathtrace import programs
 from jaxrender.pathtrace.emitters import Emitters, only
 from jaxrender.pathtrace.paths import Path, Vertex
-from jaxrender.pathtrace.programs import View, light_up, make_view, rows
-from jaxrender.pathtrace.scatter import Reflector
+from jaxrender.pathtrace.programs import Images, View, light_up, make_view
+from jaxrender.pathtrace.scatter import Reflector, reflectance
 from jaxrender.pathtrace.settings import TraceSettings
 from jaxrender.pathtrace.world import World
+from jaxrender.vec3 import Scalar, Vec3
 
 #: Lengths of the rays of ambient occlusion, over the diagonal of the scene's box.
 AO_RADII = (0.02, 0.05, 0.15)
@@ -88,11 +90,10 @@ def trace_guides(
     checks.check_at_least("height", height, 1)
     checks.check_at_least("width", width, 1)
     view = make_view(camera, height=height)
-    starts, size = programs.blocks(height * width)
     trace = functools.partial(
-        _block, world, view, block=size, height=height, width=width, settings=settings, first_sample=first_sample
+        _block, world, view, height=height, width=width, settings=settings, first_sample=first_sample
     )
-    return Traced(**joined(list(on_all_cores(trace, starts)), height=height, width=width))
+    return Traced(**programs.trace_blocks(trace, height=height, width=width))
 
 
 def pooled(first: Traced, second: Traced, *, counts: tuple[int, int]) -> Traced:
@@ -121,87 +122,104 @@ def sum_of_groups(image: Float[np.ndarray, "*b 3k"]) -> Float[np.ndarray, "*b 3"
     return image.reshape(*image.shape[:-1], -1, 3).sum(axis=-2)
 
 
-def joined(blocks: list[dict[str, np.ndarray]], *, height: int, width: int) -> dict[str, np.ndarray]:
-    """Images from blocks of pixels, by name; pixels past the last are dropped."""
-    count = height * width
-    return {
-        name: np.concatenate([block[name] for block in blocks])[:count].reshape(height, width, -1) for name in blocks[0]
-    }
-
-
 def _block(
     world: World, view: View, start: int, *, block: int, height: int, width: int, settings: TraceSettings,
     first_sample: int,
-) -> dict[str, np.ndarray]:  # fmt: skip
+) -> Images:  # fmt: skip
     """All images of `block` pixels, row by row, from pixel `start` on."""
-    spp, model, by_ratio = settings.samples_per_pixel, settings.model, settings.by_ratio
     rays, seeds = programs.eye_rays(view, start, settings.seed, 0, block=block, height=height, width=width)
-    at, path, images = programs.see(world, view, rays, model=model, by_ratio=by_ratio)
-    scattered = spp if settings.bounces else 0
-    vertex = Vertex(0, settings.light_samples, scattered, model)
-    sums = {name: np.zeros((block, 3), np.float32) for name in ("even", "odd", "squares", "met", "ao")}
+    at, path, seen = programs.see(world, view, rays, model=settings.model, by_ratio=settings.by_ratio)
+    direct = _direct(world, at, path, seeds, first_sample, settings)
+    return {**seen, **direct, **_indirect(world, at, path, seeds, first_sample, settings)}
+
+
+def _direct(
+    world: World, at: Reflector, path: Path, seeds: Array, first_sample: int, settings: TraceSettings
+) -> dict[str, Sequence[Scalar]]:
+    """Light of drawn lights on guide rays' hits."""
+    spp = settings.samples_per_pixel
+    vertex = Vertex(0, settings.light_samples, spp if settings.bounces else 0, settings.model)
     # Plain, each eye ray finds soft light for itself; by ratio, the guide ray finds it for all.
-    shares = spp if by_ratio else 1
-    soft, hard = soft_groups(world.emitters), only(world.emitters, SHARP)
-    arrived, unshadowed = np.zeros((2, block, 3 * len(soft)), np.float32)
-    for group, emitters in enumerate(soft):
-        own = slice(3 * group, 3 * group + 3)
+    shares = spp if settings.by_ratio else 1
+    arrived: list[Scalar] = []
+    unshadowed: list[Scalar] = []
+    for emitters in soft_groups(world.emitters):
+        light = {"seen": programs.black(at), "whole": programs.black(at)}
         for sample in range(first_sample, first_sample + shares):
             seen, whole = light_up(world, emitters, at, path, seeds, sample, vertex=vertex)
-            arrived[:, own] += seen / shares
-            unshadowed[:, own] += whole / shares
-    sharp = np.zeros((block, 3), np.float32)
-    if hard.groups:
-        sharp = light_up(world, hard, at, path, seeds, first_sample, vertex=vertex)[0]
+            light = programs.added(light, {"seen": seen, "whole": whole})
+        light = _scaled(light, np.float32(1.0 / shares))
+        arrived, unshadowed = [*arrived, *light["seen"]], [*unshadowed, *light["whole"]]
+    hard = only(world.emitters, SHARP)
+    sharp, _ = light_up(world, hard, at, path, seeds, first_sample, vertex=vertex)
+    return {"arrived": arrived, "unshadowed": unshadowed, "sharp": sharp}
+
+
+def _indirect(
+    world: World, at: Reflector, path: Path, seeds: Array, first_sample: int, settings: TraceSettings
+) -> dict[str, Vec3]:
+    """Light of paths from guide rays' hits, and ambient occlusion."""
+    scattered = settings.samples_per_pixel if settings.bounces else 0
+    sums = dict.fromkeys(("even", "odd", "squares", "met", "ao"), programs.black(at))
     radii = world.extent * np.asarray(AO_RADII, np.float32)
     for sample in range(scattered):
-        met, incident, ao = _follow(world, at, path, seeds, first_sample + sample, radii, settings)
-        half = "odd" if sample % 2 else "even"
-        for name, term in ((half, incident), ("squares", incident * incident), ("met", met), ("ao", ao)):
-            sums[name] += term
+        terms = _follow(world, at, path, seeds, first_sample + sample, radii, settings)
+        terms["odd" if sample % 2 else "even"] = terms.pop("incident")
+        sums = programs.added(sums, terms)
     for ray in range(settings.num_ao_rays):
-        sums["ao"] += _occlusion(world, at, seeds, first_sample + ray, radii)
-    return {**images, "arrived": arrived, "unshadowed": unshadowed, "sharp": sharp, "met": sums["met"],
-            **_means(sums, spp, num_ao=scattered + settings.num_ao_rays)}  # fmt: skip
+        rays = programs.occlusion_rays(at, seeds, np.int32(first_sample + ray))
+        hits = world.rays.closest(rays, path.alive, reach=float(radii.max()))
+        sums = programs.added(sums, {"ao": Vec3(*programs.openness(hits.t, hits.triangle, radii))})
+    counts = settings.samples_per_pixel, scattered + settings.num_ao_rays
+    return {"met": sums.pop("met"), **_means(sums, *map(np.float32, counts))}
 
 
-def _means(sums: dict[str, np.ndarray], spp: int, *, num_ao: int) -> dict[str, np.ndarray]:
-    """Means, halves and variance of incident light from sums over `spp` paths."""
+@jax.jit
+def _means(sums: dict[str, Vec3], spp: Float[Array, ""], num_ao: Float[Array, ""]) -> dict[str, Vec3]:
+    """Means, halves and variance of incident light from sums over `spp` paths; openness from one over `num_ao` rays."""
+    num_odd = jnp.floor(0.5 * spp)
     mean = (sums["even"] + sums["odd"]) / spp
-    variance = np.maximum(sums["squares"] / spp - mean * mean, 0.0) / max(spp - 1, 1)
-    odd = sums["odd"] / (spp // 2) if spp > 1 else mean
-    ao = sums["ao"] / num_ao if num_ao else np.ones_like(mean)
-    return {"incident": mean, "variance": variance, "even": sums["even"] / ((spp + 1) // 2), "odd": odd, "ao": ao}
+    spread = sums["squares"] / spp - mean * mean
+    variance = Vec3(*(jnp.maximum(c, 0.0) for c in spread)) / jnp.maximum(spp - 1.0, 1.0)
+    odd = vec3.where(num_odd > 0.0, sums["odd"] / jnp.maximum(num_odd, 1.0), mean)
+    ao = vec3.where(num_ao > 0.0, sums["ao"] / jnp.maximum(num_ao, 1.0), 1.0)
+    return {"incident": mean, "variance": variance, "even": sums["even"] / (spp - num_odd), "odd": odd, "ao": ao}
 
 
 def _follow(
     world: World, at: Reflector, path: Path, seeds: Array, sample: int, radii: np.ndarray, settings: TraceSettings
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> dict[str, Vec3]:
     """One path of indirect light from the guides' hits.
 
     Returns:
-      direct light that the first scattered ray meets, incident indirect light over the reflectance, and openness.
+      met: direct light that the first scattered ray meets. incident: indirect light over the reflectance, and its
+      squares. ao: openness.
     """
-    model, spp = settings.model, settings.samples_per_pixel
-    share = rows(programs.reflected_share(at))
-    light = np.zeros_like(share)
-    vertex = Vertex(0, settings.light_samples, spp, model)
+    model, guide, light = settings.model, at, {"light": programs.black(at)}
+    vertex = Vertex(0, settings.light_samples, settings.samples_per_pixel, model)
     for number in range(1, settings.bounces + 1):
+        seen = path.alive
         rays, path = programs.scatter(at, path, seeds, sample, vertex=vertex)
-        hits, surface = programs.hit(world, rays, None)
-        met = rows(programs.meet(world.emitters, path, rays.direction, hits.t, surface, left=vertex))
+        # First rays tell how open a place is, though they may bring no light.
+        hits, surface = programs.hit(world, rays, seen if number == 1 else path.alive, None)
+        met = programs.meet(world.emitters, path, rays.direction, hits.t, surface, left=vertex)
         if number == 1:
-            direct, ao = met, rows(programs.openness(hits.t, hits.triangle, radii))
+            direct, ao = met, Vec3(*programs.openness(hits.t, hits.triangle, radii))
         else:
-            light += met
+            light = programs.added(light, {"light": met})
         at, path = programs.arrive(path, rays.direction, surface, model=model)
         vertex = Vertex(number, 1, 1 if number < settings.bounces else 0, model)
-        light += light_up(world, world.emitters, at, path, seeds, sample, vertex=vertex)[0]
-    return direct, light / share, ao
+        drawn, _ = light_up(world, world.emitters, at, path, seeds, sample, vertex=vertex)
+        light = programs.added(light, {"light": drawn})
+    return {"met": direct, "ao": ao, **_over_reflectance(guide, light["light"])}
 
 
-def _occlusion(world: World, at: Reflector, seeds: Array, ray: int, radii: np.ndarray) -> np.ndarray:
-    """Openness along one more ray."""
-    rays = programs.occlusion_rays(at, seeds, np.int32(ray))
-    hits = world.rays.closest(rows(rays.origin), rows(rays.direction))
-    return rows(programs.openness(hits.t, hits.triangle, radii))
+@jax.jit
+def _over_reflectance(at: Reflector, light: Vec3) -> dict[str, Vec3]:
+    incident = light / reflectance(at)
+    return {"incident": incident, "squares": incident * incident}
+
+
+@jax.jit
+def _scaled(light: dict[str, Vec3], factor: Float[Array, ""]) -> dict[str, Vec3]:
+    return {name: value * factor for name, value in light.items()}

@@ -90,11 +90,14 @@ class HitSurface(NamedTuple):
     emissive: Vec3
 
 
-def surface_table(scene: Scene, *, textures: Textures | MaterialTextures | None = None) -> SurfaceTable:
+def surface_table(
+    scene: Scene, *, textures: Textures | MaterialTextures | None = None, only: tuple[str, ...] | None = None
+) -> SurfaceTable:
     """Gathers what hits may ask for; attributes that say nothing are left out. Not for use inside `jit`.
 
     Args:
       textures: of `scene_material_textures`, made here if not given.
+      only: the attributes that will be asked for; all by default.
     """
     textures = scene_material_textures(scene) if textures is None else textures
     slots = material_slots(scene.material) if textures is not None else ()
@@ -105,6 +108,9 @@ def surface_table(scene: Scene, *, textures: Textures | MaterialTextures | None 
         by_name["color"] = scene.colors
     if "normal_texture" in slots:
         by_name["tangent"] = scene.tangents
+    if only is not None:
+        # One at least.
+        by_name = {name: by_name[name] for name in by_name if name in only} or {"position": scene.positions}
     return SurfaceTable(
         corners=_corner_rows(tuple(by_name.values()), scene.faces, scene.positions, scene.uv),
         material_id=scene.material_id, material=scene.material, textures=textures, attributes=tuple(by_name),

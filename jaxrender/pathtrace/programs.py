@@ -1,25 +1,28 @@
 """The programs that run between rays, each compiled once, and rays between programs: for blocks of pixels.
 
-A host program, NumPy between the steps. Each step is one of the pure kernels of `hit_points`, `scatter`, `emitters` and
-`paths`; apart, they compute nothing twice (see `hit_points`).
+A host program. Each step is one of the pure kernels of `hit_points`, `scatter`, `emitters` and `paths`; apart, they
+compute nothing twice (see `hit_points`). What is in between stays where JAX has it: only rays on the host are fetched,
+by the world's `RayScene`, and the images of a block when it is done.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxrender import vec3
 from jaxrender.camera import Camera, look_at, project_px
 from jaxrender.machine import num_cores
 from jaxrender.pathtrace import paths
+from jaxrender.pathtrace.backends import on_the_device
 from jaxrender.pathtrace.emitters import Emitters
 from jaxrender.pathtrace.guide_lookup import guide_lookup
 from jaxrender.pathtrace.hit_points import (
+    HitPoints,
     HitSurface,
     SurfaceTable,
     apply_material,
@@ -33,10 +36,10 @@ from jaxrender.pathtrace.paths import Path, Rays, Vertex
 from jaxrender.pathtrace.scatter import Reflector, draw, make_reflector, reflectance
 from jaxrender.pathtrace.sharpness import sharpness
 from jaxrender.pathtrace.world import World
-from jaxrender.vec3 import Vec3
+from jaxrender.vec3 import Scalar, Vec3
 
-#: Most pixels of a block: large enough that programs outweigh what calls them.
-BLOCK = 1 << 16
+#: Most pixels of a block: on a CPU, large enough that programs outweigh what calls them; elsewhere, what fills a GPU.
+BLOCK, GPU_BLOCK = 1 << 16, 1 << 20
 
 #: Glossy surfaces below this roughness mirror lamps: scattered rays must look for them, too.
 SMOOTH = 0.3
@@ -45,15 +48,35 @@ SMOOTH = 0.3
 _LENS, _OCCLUSION = 1000, 1001
 
 
+Images = Mapping[str, Sequence[Scalar]]
+
+
 def blocks(num_pixels: int) -> tuple[range, int]:
-    """Where the blocks of a picture start, and their size, so that each core gets some.
+    """Where the blocks of a picture start, and their size: so that each core of a CPU gets some, and few on a GPU.
 
     The last one may reach beyond the last pixel.
     """
+    if jax.default_backend() != "cpu":
+        size = -(-num_pixels // -(-num_pixels // GPU_BLOCK))
+        return range(0, num_pixels, size), size
     size = BLOCK
     while size > 256 and num_pixels < 2 * num_cores() * size:
         size //= 2
     return range(0, num_pixels, size), size
+
+
+def trace_blocks(trace: Callable[..., Images], *, height: int, width: int) -> dict[str, Float[np.ndarray, "h w c"]]:
+    """Images from `trace(start, block=size)`, which gives their channels apart, by name; fetched block by block."""
+    starts, size = blocks(height * width)
+
+    def fetched(start: int) -> dict[str, np.ndarray]:
+        return jax.device_get(_side_by_side(trace(start, block=size)))
+
+    found = list(on_the_device(fetched, starts))
+    return {
+        name: np.concatenate([block[name] for block in found])[: height * width].reshape(height, width, -1)
+        for name in found[0]
+    }
 
 
 class View(NamedTuple):
@@ -74,65 +97,58 @@ def make_view(camera: Camera, *, height: int) -> View:
     return View(eye, right, up, backward, step)
 
 
-def rows(v: Sequence[Array | np.ndarray]) -> np.ndarray:
-    """Components side by side, (n, 3), as Embree and images want them."""
-    return np.stack([np.asarray(c) for c in v], axis=-1)
-
-
 def see(
     world: World, view: View, rays: Rays, *, model: str, by_ratio: bool
-) -> tuple[Reflector, Path, dict[str, np.ndarray]]:
+) -> tuple[Reflector, Path, dict[str, Sequence[Scalar]]]:
     """The surface that eye rays see: reflection, path, and images of it.
 
     Args:
       by_ratio: lights are only drawn, but where the surface is so smooth that it mirrors them.
     """
-    hits, surface = hit(world, rays, view.step)
-    path = paths.begin(len(hits.triangle))
+    path = paths.begin(len(rays.direction.x))
+    hits, surface = hit(world, rays, path.alive, view.step)
     emission = meet(world.emitters, path, rays.direction, hits.t, surface, left=Vertex(-1, 0, 1, model))
     at, path = arrive(path, rays.direction, surface, model=model)
-    smooth = np.asarray(at.roughness < SMOOTH) & (rows(at.mirror).any(axis=-1))
-    path = path._replace(shared=smooth | (not by_ratio))
-    seen = (hits.triangle >= 0)[:, None]
-    position = rows(at.position)
-    depth = ((np.asarray(view.eye) - position) @ np.asarray(view.backward))[:, None]
-    images = {"albedo": rows(reflected_share(at)), "normal": rows(at.normal), "position": position, "depth": depth,
-              "sharpness": np.asarray(_sharpness(at))[:, None]}  # fmt: skip
-    images = {name: np.where(seen, image, np.float32(0.0)) for name, image in images.items()}
-    return at, path, images | {"emission": rows(emission)}
+    path, images = _look(view, at, path, by_ratio=by_ratio)
+    return at, path, images | {"emission": emission}
 
 
-def hit(world: World, rays: Rays, width: float | np.float32 | None) -> tuple[Hits, HitSurface]:
-    """The closest hits, and the surface there.
+def hit(
+    world: World, rays: Rays, wanted: Bool[Array, " n"], width: float | np.float32 | None
+) -> tuple[Hits, HitSurface]:
+    """The closest hits of the rays that are wanted, and the surface there.
 
     Args:
       width: of the rays at distance 1, for textures; None is the finest.
     """
-    hits = world.rays.closest(rows(rays.origin), rows(rays.direction))
+    hits = world.rays.closest(rays, wanted)
     corners = _gather(world.table, hits.triangle)
-    wide = None if width is None else np.where(hits.triangle >= 0, hits.t, np.float32(0.0)) * width
-    points = _interpolate(world.table, corners, hits.triangle, hits.barycentrics, rays.direction, wide)
+    points = _interpolate(world.table, corners, hits, rays.direction, width)
     return hits, _material(world.table, points, _texels(world.table, points, fine=width is None))
 
 
 def light_up(
     world: World, emitters: Emitters, at: Reflector, path: Path, seeds: Array, index: int, *, vertex: Vertex
-) -> tuple[np.ndarray, np.ndarray]:
-    """Light of drawn lights: what arrives, and what would arrive if nothing were in between.
-
-    Only rays that would bring light are traced.
-    """
-    arrived, unshadowed = np.zeros((2, len(seeds), 3), np.float32)
+) -> tuple[Vec3, Vec3]:
+    """Light of drawn lights: what arrives, and what would arrive if nothing were in between."""
+    arrived = unshadowed = black(at)
+    if not emitters.groups:
+        return arrived, unshadowed
     number, vertex = np.int32(vertex.number), vertex._replace(number=0)
     for shadow in _draw_lights(emitters, world.table, at, path, seeds, np.int32(index), number, vertex=vertex):
-        light = rows(shadow.light)
-        unshadowed += light
-        tried = np.flatnonzero(light.any(axis=-1))
-        origins, directions = (rows([np.asarray(c)[tried] for c in v]) for v in shadow[:2])
-        blocked = world.rays.blocked(origins, directions, np.asarray(shadow.distance)[tried])
-        light[tried[blocked]] = 0.0
-        arrived += light
+        arrived, unshadowed = _add_light(arrived, unshadowed, shadow.light, world.rays.blocked(shadow))
     return arrived, unshadowed
+
+
+def black(at: Reflector) -> Vec3:
+    """No light, at each of these points."""
+    return Vec3(*(jnp.zeros_like(at.roughness),) * 3)
+
+
+@jax.jit
+def added(sums: dict[str, Vec3], terms: dict[str, Vec3]) -> dict[str, Vec3]:
+    """The sums with terms added to those of their name."""
+    return sums | {name: sums[name] + term for name, term in terms.items()}
 
 
 @functools.partial(jax.jit, static_argnames=("block", "height", "width"))
@@ -154,9 +170,10 @@ def eye_rays(view: View, start, seed, sample, *, block: int, height: int, width:
 @functools.partial(jax.jit, static_argnames=("height", "width"))
 def look_up_guides(
     image: Float[Array, "h w c"], normal: Float[Array, "h w 3"], depth: Float[Array, "h w 1"], camera: Camera,
-    own: dict[str, Float[Array, "n _"]], *, height: int, width: int,
+    seen: dict[str, Sequence[Scalar]], *, height: int, width: int,
 ) -> Float[Array, "n c"]:  # fmt: skip
     """`guide_lookup` for surfaces that eye rays see."""
+    own = {name: jnp.stack(seen[name], axis=-1) for name in ("position", "normal", "depth")}
     places, _ = project_px(camera, own["position"], height=height, width=width)
     found, _ = guide_lookup(
         image, normal, depth, places_px=places, sample_normal=own["normal"], sample_depth=own["depth"]
@@ -219,11 +236,40 @@ def meet(
     return _meet(emitters, path, direction, distance, surface, left=left._replace(number=0))
 
 
+@functools.partial(jax.jit, static_argnames="by_ratio")
+def _look(view: View, at: Reflector, path: Path, *, by_ratio: bool) -> tuple[Path, Images]:
+    """Images of what eye rays see, 0 where that is nothing; and which paths find lights both ways."""
+    seen = path.alive
+    smooth = (at.roughness < SMOOTH) & (vec3.largest(at.mirror) > 0.0)
+    depth = vec3.dot(view.eye - at.position, view.backward)
+    images = {"albedo": reflectance(at), "normal": at.normal, "position": at.position}
+    channels: dict[str, Sequence[Scalar]] = {**images, "depth": (depth,), "sharpness": (sharpness(at),)}
+    masked = {name: [jnp.where(seen, c, 0.0) for c in image] for name, image in channels.items()}
+    return path._replace(shared=smooth | (not by_ratio)), masked
+
+
+@jax.jit
+def _interpolate(
+    table: SurfaceTable, corners: Float[Array, "c n"], hits: Hits, direction: Vec3, width: Float[Array, ""] | None
+) -> HitPoints:
+    wide = None if width is None else jnp.where(hits.triangle >= 0, hits.t, 0.0) * width
+    triangle, barycentrics = (jnp.asarray(x) for x in (hits.triangle, hits.barycentrics))
+    return interpolate(table, corners, triangle, barycentrics, direction, wide)
+
+
+@jax.jit
+def _add_light(arrived: Vec3, unshadowed: Vec3, light: Vec3, blocked: Bool[Array, " n"]) -> tuple[Vec3, Vec3]:
+    return arrived + vec3.where(~blocked, light, 0.0), unshadowed + light
+
+
+@jax.jit
+def _side_by_side(images: Images) -> dict[str, Float[Array, "n c"]]:
+    none = jnp.zeros((next(len(channels[0]) for channels in images.values() if len(channels)), 0))
+    return {name: jnp.stack(channels, axis=-1) if len(channels) else none for name, channels in images.items()}
+
+
 _meet = jax.jit(paths.meet, static_argnames="left")
-reflected_share = jax.jit(reflectance)
 openness = jax.jit(paths.openness)
-_sharpness = jax.jit(sharpness)
 _gather = jax.jit(gather_corners)
-_interpolate = jax.jit(interpolate)
 _texels = jax.jit(look_up_texels, static_argnames="fine")
 _material = jax.jit(apply_material)

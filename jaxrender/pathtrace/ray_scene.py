@@ -1,100 +1,50 @@
-"""A scene that rays can be traced in, on all cores through Embree, holes of masked materials included."""
+"""What paths ask of a scene's rays, whichever backend answers, and where masked materials have holes."""
 
-import jax
+from typing import Protocol
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxrender.pathtrace.embree import EmbreeScene
 from jaxrender.pathtrace.hit_points import SurfaceTable, hit_surface
 from jaxrender.pathtrace.hits import Hits
+from jaxrender.pathtrace.paths import Rays, ShadowRays
 from jaxrender.scene import MASK, Scene
 from jaxrender.vec3 import Vec3
 
-#: Holes that a ray may pass; then it stops.
-MOST_HOLES = 64
 
-#: Relative to the size of coordinates, how far behind a hole a ray goes on.
-_STEP = 4e-6
+class RayScene(Protocol):
+    """Closest hits and shadow tests in a `Scene`. Where the alpha of a masked material is below its cutoff, rays pass.
 
-
-class RayScene:
-    """Closest hits and shadow tests in a `Scene`; NumPy in, NumPy out, on the calling thread.
-
-    Where the alpha of a masked material is below its cutoff, rays pass. Solid and masked triangles are kept apart for
-    shadow tests, so that only rays that meet a masked one are followed through holes.
+    Arrays come from the programs of paths and go to them: a backend on the host fetches them, one on the device does
+    not.
     """
 
-    def __init__(self, scene: Scene, table: SurfaceTable):
-        vertices, faces = np.asarray(scene.positions), np.asarray(scene.faces)
-        masked = np.asarray(scene.material.alpha_mode)[np.asarray(scene.material_id)] == MASK
-        self._table = table
-        self._masked_faces = np.flatnonzero(masked).astype(np.int32)
-        self._all = EmbreeScene(vertices, faces)
-        self._solid = self._all if not masked.any() else None
-        if self._solid is None:
-            self._holed = EmbreeScene(vertices, faces[masked])
-            self._solid = EmbreeScene(vertices, faces[~masked]) if not masked.all() else None
+    def closest(self, rays: Rays, wanted: Bool[Array, " n"], *, reach: float = float("inf")) -> Hits:
+        """The first solid point along each ray.
 
-    def closest(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Hits:
-        """The first solid point along each unit direction."""
-        hits = self._all.closest_hit(origins, directions)
-        if not len(self._masked_faces):
-            return hits
-        return self._through_holes(self._all, hits, origins, directions, None)
+        Args:
+          wanted: the other rays miss, and cost next to nothing.
+          reach: what is further away may be missed.
+        """
+        ...
 
-    def blocked(
-        self,
-        origins: Float[np.ndarray, "n 3"],
-        directions: Float[np.ndarray, "n 3"],
-        distance: Float[np.ndarray, " n"],
-    ) -> Bool[np.ndarray, " n"]:
-        """Whether anything solid is nearer than `distance` along each unit direction."""
-        found = np.zeros(len(origins), bool)
-        if self._solid is not None:
-            found = self._solid.any_hit(origins, directions, max_distance=distance)
-        if not len(self._masked_faces):
-            return found
-        open_ = np.flatnonzero(~found)
-        o, d, t = (np.ascontiguousarray(x[open_]) for x in (origins, directions, distance))
-        hits = self._holed.closest_hit(o, d, max_distance=t)
-        hits = self._through_holes(self._holed, hits, o, d, self._masked_faces)
-        found[open_] = (hits.triangle >= 0) & (hits.t < t)
-        return found
+    def blocked(self, shadow: ShadowRays) -> Bool[Array | np.ndarray, " n"]:
+        """Whether anything solid is nearer than the light; rays that would bring none are not traced."""
+        ...
 
-    def _through_holes(
-        self, scene: EmbreeScene, hits: Hits, origins: np.ndarray, directions: np.ndarray,
-        names: Int[np.ndarray, " m"] | None,
-    ) -> Hits:  # fmt: skip
-        """Hits with rays that hit a hole traced on; `names` are the scene's triangles by those of `scene`."""
-        triangle, t, uv = np.array(hits.triangle), np.array(hits.t), np.array(hits.barycentrics)
-        origin = np.array(origins)
-        begun = np.zeros(len(t), np.float32)
-        rest = np.flatnonzero(triangle >= 0)
-        for _ in range(MOST_HOLES):
-            own = triangle[rest] if names is None else names[triangle[rest]]
-            rest = rest[self._is_hole(own, uv[rest])]
-            if not len(rest):
-                break
-            step = t[rest] + _STEP * (np.abs(origin[rest]).max(axis=1) + t[rest])
-            begun[rest] += step
-            origin[rest] += step[:, None] * directions[rest]
-            next_hits = scene.closest_hit(np.ascontiguousarray(origin[rest]), np.ascontiguousarray(directions[rest]))
-            triangle[rest], t[rest], uv[rest] = next_hits.triangle, next_hits.t, next_hits.barycentrics
-            rest = rest[triangle[rest] >= 0]
-        return Hits(triangle, t + begun, uv)
-
-    def _is_hole(self, triangle: np.ndarray, barycentrics: np.ndarray) -> np.ndarray:
-        """Padded to a power of two, so that few programs are compiled."""
-        count = len(triangle)
-        padded = max(256, 1 << max(count - 1, 0).bit_length())
-        triangle = np.pad(triangle, (0, padded - count), constant_values=-1)
-        barycentrics = np.pad(barycentrics, [(0, padded - count), (0, 0)])
-        return np.asarray(_is_hole(self._table, triangle, barycentrics))[:count]
+    def moved(self, scene: Scene, table: SurfaceTable) -> "RayScene":
+        """That of the same scene in another pose, by the same backend."""
+        ...
 
 
-@jax.jit
-def _is_hole(table: SurfaceTable, triangle: Int[Array, " n"], barycentrics: Float[Array, "n 2"]) -> Bool[Array, " n"]:
+def masked_triangles(scene: Scene) -> Bool[np.ndarray, " t"]:
+    """Which triangles may have holes."""
+    return np.asarray(scene.material.alpha_mode)[np.asarray(scene.material_id)] == MASK
+
+
+def is_hole(table: SurfaceTable, triangle: Int[Array, " n"], barycentrics: Float[Array, "n 2"]) -> Bool[Array, " n"]:
+    """Whether points of triangles are in holes of masked materials; not where the triangle is -1."""
     down = Vec3(*(jnp.full(triangle.shape, x, jnp.float32) for x in (0.0, -1.0, 0.0)))
     surface = hit_surface(table, triangle, barycentrics, down)
     own = table.material_id[jnp.maximum(triangle, 0)]

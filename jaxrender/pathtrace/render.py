@@ -1,35 +1,39 @@
 """Scene and camera -> light of guide rays, filtered, looked up for all eye rays: the picture.
 
 The steps are those of Bauszat, Eisemann, Magnor, "Guided Image Filtering for Interactive High-quality Global
-Illumination", 2011, section 3, with an answer to soft shadows added (`shadow_ratio`). They run on the host, block by
-block of pixels, as many at once as there are cores. The same seed gives the same picture.
+Illumination", 2011, section 3, with an answer to soft shadows added (`shadow_ratio`). They run block by block of
+pixels, as many at once as a CPU has cores. The same seed gives the same picture.
 """
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
+from jaxrender import vec3
 from jaxrender.camera import Camera
 from jaxrender.filters.aovs import Aovs
 from jaxrender.filters.denoiser import denoise
 from jaxrender.filters.settings import DenoiseSettings
-from jaxrender.machine import on_all_cores
 from jaxrender.pathtrace import programs
 from jaxrender.pathtrace.emitters import only
-from jaxrender.pathtrace.guide_rays import SHARP, Traced, joined, soft_groups, sum_of_groups, trace_guides
+from jaxrender.pathtrace.guide_rays import SHARP, Traced, soft_groups, trace_guides
 from jaxrender.pathtrace.paths import Vertex
-from jaxrender.pathtrace.programs import light_up, make_view, rows, unshadowed_light
+from jaxrender.pathtrace.programs import light_up, make_view, unshadowed_light
 from jaxrender.pathtrace.settings import TraceSettings
 from jaxrender.pathtrace.shadow_ratio import UNSHADOWED, filtered_ratio, ratio_radius
 from jaxrender.pathtrace.sharpness import blend_windows, window_radii
 from jaxrender.pathtrace.world import World, prepare
 from jaxrender.scene import Scene
+from jaxrender.vec3 import Scalar, Vec3
+
+#: Of a picture; they add up to it.
+PARTS = ("direct", "indirect", "emission")
 
 # Radii that are wanted this near below one are not worth another.
 _NEAR = 0.5
@@ -74,8 +78,9 @@ def render(
 def render_direct(
     scene: Scene | World, camera: Camera, *, height: int, width: int, settings: TraceSettings | None = None
 ) -> Float[np.ndarray, "h w 3"]:
-    """The direct light of guide rays, unfiltered, with the reflectance in it."""
-    return trace_guides(_opened(scene), camera, height=height, width=width, settings=settings or TraceSettings()).direct
+    """The direct light of guide rays, unfiltered, with the reflectance in it: that of no bounces, by drawn lights."""
+    alone = dataclasses.replace(settings or TraceSettings(), bounces=0, ao_rays=0)
+    return trace_guides(_opened(scene), camera, height=height, width=width, settings=alone).direct
 
 
 def render_indirect(
@@ -125,18 +130,29 @@ def combine(
 ) -> Rendered:  # fmt: skip
     """All eye rays: each has its own surface and direct light, and the filtered light of the guide ray most like it."""
     height, width = guides.incident.shape[:2]
-    spp = settings.samples_per_pixel
-    looked_up = [incident, guides.met / np.maximum(guides.albedo, 1e-3)]
-    if settings.by_ratio:
-        looked_up += _ratios(world, guides, settings)
-    images = jnp.asarray(np.concatenate(looked_up, axis=-1)), jnp.asarray(guides.normal), jnp.asarray(guides.depth)
-    filtered = dataclasses.replace(guides, incident=incident)
-    starts, size = programs.blocks(height * width)
-    trace = functools.partial(_block, world, camera, filtered, images, block=size, settings=settings)
-    sums = joined(list(on_all_cores(trace, starts)), height=height, width=width)
-    parts = {name: image / spp for name, image in sums.items()}
+    # All is known of guide rays already, but for soft light that goes by ratio.
+    known = not (settings.by_ratio and soft_groups(world.emitters))
+    own = {"direct": guides.direct, "indirect": guides.albedo * incident, "emission": guides.emission}
+    sums = own if known else dict.fromkeys(PARTS, np.zeros_like(incident))
+    samples = range(1 if known else 0, settings.samples_per_pixel)
+    if samples:
+        images = _looked_up(world, guides, incident, settings)
+        trace = functools.partial(_block, world, camera, images, samples, height=height, width=width, settings=settings)
+        traced = programs.trace_blocks(trace, height=height, width=width)
+        sums = {name: sums[name] + traced[name] for name in PARTS}
+    parts = {name: image / settings.samples_per_pixel for name, image in sums.items()}
     image = sum(parts.values(), np.zeros_like(incident))
     return Rendered(image, **parts, incident=incident, guides=guides, chosen=chosen or {})
+
+
+def _looked_up(
+    world: World, guides: Traced, incident: Float[np.ndarray, "h w 3"], settings: TraceSettings
+) -> tuple[Array, Array, Array]:
+    """What eye rays take from guide rays, side by side, and what they find them by."""
+    values = [incident, guides.met / np.maximum(guides.albedo, 1e-3)]
+    if settings.by_ratio:
+        values += _ratios(world, guides, settings)
+    return jnp.asarray(np.concatenate(values, axis=-1)), jnp.asarray(guides.normal), jnp.asarray(guides.depth)
 
 
 def _ratios(world: World, guides: Traced, settings: TraceSettings) -> list[np.ndarray]:
@@ -153,47 +169,48 @@ def _ratios(world: World, guides: Traced, settings: TraceSettings) -> list[np.nd
 
 
 def _block(
-    world: World, camera: Camera, guides: Traced, images: tuple[Array, Array, Array], start: int, *, block: int,
-    settings: TraceSettings,
-) -> dict[str, np.ndarray]:  # fmt: skip
-    """Sums over eye rays, for `block` pixels. `guides` have the filtered incident light."""
-    height, width = guides.incident.shape[:2]
+    world: World, camera: Camera, images: tuple[Array, Array, Array], samples: range, start: int, *, block: int,
+    height: int, width: int, settings: TraceSettings,
+) -> dict[str, Vec3]:  # fmt: skip
+    """Sums over eye rays, for `block` pixels."""
     view, spp, model = make_view(camera, height=height), settings.samples_per_pixel, settings.model
-    soft, hard = soft_groups(world.emitters), only(world.emitters, SHARP)
-    names = ("arrived", "sharp", "met", "emission", "albedo", "incident")
-    own = {name: _cut(getattr(guides, name), start, block) for name in names}
-    sums = {name: np.zeros((block, 3), np.float32) for name in ("direct", "indirect", "emission")}
     vertex = Vertex(0, settings.light_samples, spp if settings.bounces else 0, model)
-    for sample in range(spp):
-        if sample == 0 and not (settings.by_ratio and soft):
-            # All is known of guide rays already.
-            sums["direct"] += sum_of_groups(own["arrived"]) + own["sharp"] + own["met"]
-            sums["emission"] += own["emission"]
-            sums["indirect"] += own["albedo"] * own["incident"]
-            continue
+    many = vertex._replace(drawn=max(1, UNSHADOWED // spp))
+    by_ratio = soft_groups(world.emitters) if settings.by_ratio else []
+    drawn = only(world.emitters, SHARP) if settings.by_ratio else world.emitters
+    sums: dict[str, Vec3] = {}
+    for sample in samples:
         rays, seeds = programs.eye_rays(view, start, settings.seed, sample, block=block, height=height, width=width)
         at, path, seen = programs.see(world, view, rays, model=model, by_ratio=True)
-        found = np.asarray(programs.look_up_guides(*images, camera, seen, height=height, width=width))
-        sums["emission"] += seen["emission"]
-        sums["indirect"] += seen["albedo"] * found[:, :3]
-        if hard.groups:
-            sums["direct"] += light_up(world, hard, at, path, seeds, sample, vertex=vertex)[0]
-        # Lamps that smooth surfaces mirror are met by the guides' paths only.
-        sums["direct"] += np.where(np.asarray(path.shared)[:, None], seen["albedo"] * found[:, 3:6], np.float32(0.0))
-        for group, emitters in enumerate(soft):
-            if not settings.by_ratio:
-                sums["direct"] += light_up(world, emitters, at, path, seeds, sample, vertex=vertex)[0]
-                continue
-            many = vertex._replace(drawn=max(1, UNSHADOWED // spp))
-            whole = rows(unshadowed_light(emitters, world.table, at, path, seeds, np.int32(sample), vertex=many))
-            sums["direct"] += whole * found[:, 6 + 3 * group : 9 + 3 * group]
+        found = programs.look_up_guides(*images, camera, seen, height=height, width=width)
+        light, _ = light_up(world, drawn, at, path, seeds, sample, vertex=vertex)
+        whole = [
+            unshadowed_light(emitters, world.table, at, path, seeds, np.int32(sample), vertex=many)
+            for emitters in by_ratio
+        ]
+        parts = _parts(seen, found, path.shared, light, whole)
+        sums = programs.added(sums, parts) if sums else parts
     return sums
 
 
 _blend = jax.jit(blend_windows)
 
 
-def _cut(image: Float[np.ndarray, "h w c"], start: int, count: int) -> np.ndarray:
-    """`count` pixels from pixel `start` on; past the last, zeros."""
-    pixels = image.reshape(-1, image.shape[-1])[start : start + count]
-    return np.pad(pixels, [(0, count - len(pixels)), (0, 0)])
+@jax.jit
+def _parts(
+    seen: dict[str, Sequence[Scalar]], found: Float[Array, "n c"], mirrors: Bool[Array, " n"], light: Vec3,
+    whole: Sequence[Vec3],
+) -> dict[str, Vec3]:  # fmt: skip
+    """The light of eye rays.
+
+    Args:
+      found: what `_looked_up` gives, of the guide ray that is most alike.
+      mirrors: where lamps that smooth surfaces mirror are met, which the guides' paths do alone.
+      whole: light of each soft group that nothing is in front of.
+    """
+    incident, met, *ratios = (vec3.from_array(found[:, 3 * k : 3 * k + 3]) for k in range(found.shape[1] // 3))
+    albedo = Vec3(*seen["albedo"])
+    direct = light + vec3.where(mirrors, albedo * met, 0.0)
+    for value, ratio in zip(whole, ratios, strict=True):
+        direct = direct + value * ratio
+    return {"direct": direct, "indirect": albedo * incident, "emission": Vec3(*seen["emission"])}

@@ -30,6 +30,11 @@ _FAR_INFLATION = 1.0 + 4e-7
 _SMALLEST_COMPONENT = 1e-18
 
 
+#: Whether hits count: accept(place, barycentrics) of n hits, by 2 · leaf + place in the leaf (-1 is none), with the
+#: corners in the order of the leaves; a `jax.tree_util.Partial` of a function and its arrays.
+Accept = jax.tree_util.Partial
+
+
 class Nodes(NamedTuple):
     """The arrays that a step reads: boxes (m, 6, 8), codes of the children (8 m), triangles of the leaves."""
 
@@ -64,6 +69,7 @@ def closest_hit(
     directions: Float[Array, "n 3"],
     *,
     max_distance: Float[Array, " n"] | None = None,
+    accept: Accept | None = None,
 ) -> Hits:
     """The first face along each ray, from either side, with 0 <= t < max_distance.
 
@@ -74,11 +80,12 @@ def closest_hit(
 
     Args:
       max_distance: in units of the direction's length.
+      accept: which hits count, such as those that are not in a hole; rays go on through the others. All by default.
     Raises:
       ValueError: for shapes other than those above.
     """
     limit = checked_limit(origins, directions, max_distance)
-    found = _find(bvh, origins, directions, limit, stop_at_first=False)
+    found = _find(bvh, origins, directions, limit, accept, stop_at_first=False)
     return _hits_on_faces(found, bvh.leaf_faces, bvh.vertices, bvh.faces, origins, directions)
 
 
@@ -88,10 +95,11 @@ def any_hit(
     directions: Float[Array, "n 3"],
     *,
     max_distance: Float[Array, " n"] | None = None,
+    accept: Accept | None = None,
 ) -> Bool[Array, " n"]:
     """Whether each ray meets a face with 0 <= t < max_distance: `closest_hit` that stops at the first it finds."""
     limit = checked_limit(origins, directions, max_distance)
-    return _find(bvh, origins, directions, limit, stop_at_first=True) >= 0
+    return _find(bvh, origins, directions, limit, accept, stop_at_first=True) >= 0
 
 
 def checked_limit(origins: Array, directions: Array, max_distance: Array | None) -> Float[Array, " n"]:
@@ -134,15 +142,17 @@ def finished_hits(
     return Hits(triangle, t, jnp.where(hit[:, None], barycentrics, 0.0), instance)
 
 
-def _find(bvh: Bvh, origins: Array, directions: Array, limit: Array, *, stop_at_first: bool) -> Int[Array, " n"]:
+def _find(
+    bvh: Bvh, origins: Array, directions: Array, limit: Array, accept: Accept | None, *, stop_at_first: bool
+) -> Int[Array, " n"]:
     nodes = Nodes(bvh.boxes, bvh.children.reshape(-1), bvh.leaf_triangles)
     nodes, origins, directions = jax.lax.stop_gradient((nodes, origins, directions))
     rays = origins.astype(jnp.float32), directions.astype(jnp.float32), limit
-    return _search(nodes, *rays, depth=bvh.depth, stop_at_first=stop_at_first, plan=plan_for_backend())
+    return _search(nodes, *rays, accept, depth=bvh.depth, stop_at_first=stop_at_first, plan=plan_for_backend())
 
 
 @functools.partial(jax.jit, static_argnames=("depth", "stop_at_first", "plan"))
-def _search(nodes: Nodes, origins, directions, limit, *, depth: int, stop_at_first: bool, plan: Plan):
+def _search(nodes: Nodes, origins, directions, limit, accept, *, depth: int, stop_at_first: bool, plan: Plan):
     """The wavefront, apart from the rest: its program depends on the mesh through the size of the tree only."""
 
     def trace(o, d, limit):
@@ -153,7 +163,7 @@ def _search(nodes: Nodes, origins, directions, limit, *, depth: int, stop_at_fir
 
     def step(state: State) -> State:
         rays, search = state.each
-        search = tested_leaf(nodes, rays, search)
+        search = tested_leaf(nodes, rays, search, accept)
         if stop_at_first:
             search = stopped(search, search.found >= 0)
         search, stack = visited_node(nodes, rays, search, state.stack)
@@ -191,7 +201,7 @@ def stopped(search: Search, stop: Bool[Array, " k"]) -> Search:
     return search._replace(group=group, leaves=leaves, height=height)
 
 
-def tested_leaf(nodes: Nodes, rays: Rays, search: Search) -> Search:
+def tested_leaf(nodes: Nodes, rays: Rays, search: Search, accept: Accept | None = None) -> Search:
     """The search after the triangles of the next leaf, for rays that have one."""
     some = search.leaves != 0
     leaf = jnp.where(some, ~next_child(nodes, search.leaves, rays.octant), 0)
@@ -199,6 +209,9 @@ def tested_leaf(nodes: Nodes, rays: Rays, search: Search) -> Search:
     for place in range(corners.shape[1]):
         distance = hit_distance(corners[:, place], rays.origin, rays.direction, rays.plane_axes)
         nearer = some & (distance >= 0) & (distance < t)
+        if accept is not None:
+            _, barycentrics = hit_parameters(corners[:, place], rays.origin, rays.direction)
+            nearer &= accept(jnp.where(nearer, 2 * leaf + place, -1), barycentrics)
         t, found = jnp.where(nearer, distance, t), jnp.where(nearer, 2 * leaf + place, found)
     return search._replace(leaves=without_next(search.leaves), t=t, found=found)
 

@@ -1,15 +1,19 @@
 """A scene made ready for paths: surfaces by triangle, lights, and rays."""
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrender.deferred.pipeline import default_lights
+from jaxrender.pathtrace.backends import RayBackend, chosen_backend
+from jaxrender.pathtrace.embree_rays import EmbreeRays
 from jaxrender.pathtrace.emitters import ALL_GROUPS, Emitters, make_emitters
 from jaxrender.pathtrace.hit_points import SurfaceTable, surface_table
 from jaxrender.pathtrace.ray_scene import RayScene
+from jaxrender.pathtrace.tree_rays import tree_rays
 from jaxrender.scene import Lights, Scene, scene_bounds
 from jaxrender.sh_basis import basis_columns
 
@@ -26,15 +30,22 @@ class World:
 
 
 def prepare(
-    scene: Scene, *, lights: Lights | None = None, environment: Float[np.ndarray, "h w 3"] | None = None
+    scene: Scene,
+    *,
+    lights: Lights | None = None,
+    environment: Float[np.ndarray, "h w 3"] | None = None,
+    rays: RayBackend = "auto",
 ) -> World:
     """Builds what rays and paths need of a scene.
 
     A scene without any light gets a sun and a sky, with a note that says so.
 
+    Args:
+      rays: who traces them: "embree" on the CPU, "jax" on the device that JAX uses, or "auto" (`chosen_backend`).
     Raises:
-      ValueError: naming the field, if positions are not finite.
+      ValueError: naming the field, if positions are not finite; for another name of `rays`.
     """
+    open_rays: Callable[..., RayScene] = EmbreeRays if chosen_backend(rays) == "embree" else tree_rays
     _check_finite(scene)
     table = surface_table(scene)
     emitters = make_emitters(scene, table, lights=lights, environment=environment)
@@ -44,7 +55,7 @@ def prepare(
         emitters = make_emitters(scene, table, lights=sun, environment=sky_image(ambient))
         notes = ("no lights, a sun and a sky were added",)
     low, high = (np.asarray(corner, np.float64) for corner in scene_bounds(scene))
-    return World(table, emitters, RayScene(scene, table), float(np.linalg.norm(high - low)) or 1.0, notes)
+    return World(table, emitters, open_rays(scene, table), float(np.linalg.norm(high - low)) or 1.0, notes)
 
 
 def sky_image(ambient: Float[Array, "3 k"], *, height: int = 32) -> Float[np.ndarray, "h w 3"]:
@@ -61,7 +72,8 @@ def sky_image(ambient: Float[Array, "3 k"], *, height: int = 32) -> Float[np.nda
 def move(world: World, scene: Scene) -> World:
     """The world of the same scene in another pose: with the same faces, materials and images.
 
-    Textures, lights without extent and surroundings stay; so does `extent`, so that guides mean the same in all frames.
+    Textures, lights without extent and surroundings stay, and so does who traces the rays; `extent` too, so that guides
+    mean the same in all frames.
 
     Raises:
       ValueError: if the number of triangles differs, or positions are not finite.
@@ -74,7 +86,7 @@ def move(world: World, scene: Scene) -> World:
     emitters = make_emitters(scene, table, lights=world.emitters.lights)
     groups = tuple(group for group in ALL_GROUPS if group in (*emitters.groups, *world.emitters.groups))
     emitters = dataclasses.replace(emitters, environment=world.emitters.environment, groups=groups)
-    return World(table, emitters, RayScene(scene, table), world.extent, world.notes)
+    return World(table, emitters, world.rays.moved(scene, table), world.extent, world.notes)
 
 
 def _check_finite(scene: Scene) -> None:
