@@ -30,6 +30,7 @@ from jaxrender.harmonics.pose_model import PoseModel
 from jaxrender.io.atomic import write_bytes
 from jaxrender.io.character import load_character
 from jaxrender.machine import is_writable_folder
+from jaxrender.pathtrace.backends import chosen_backend, told_backend
 
 if TYPE_CHECKING:
     from fitting.evaluate import Evaluation
@@ -161,7 +162,7 @@ def train_and_report(
     _check_writable(out)
     from fitting.train import train_character
 
-    console.announce_device(rays="Embree")
+    console.announce_device(rays=told_backend(chosen_backend(settings.bake.rays)))
     with (
         _named_by_file(character, source, out),
         console.keeping(f"the frames baked so far are in {out}; the same command continues"),
@@ -193,7 +194,7 @@ def evaluate_and_report(
     from fitting.train import TrainResult
     from fitting.training_data import bake_character
 
-    console.announce_device(rays="Embree")
+    console.announce_device(rays=told_backend(chosen_backend(settings.bake.rays)))
     data, _, motion = bake_character(character, settings, file.parent / "bake.zarr", track=_track)
     if len(model.axes) != len(data.visible):
         bad_input(file, "axes", expected=f"{len(data.visible)} points, as its settings make", got=len(model.axes))

@@ -23,8 +23,11 @@ class BakeSettings:
     max_points: int = 0
     """At most this many shading points, spread evenly over the mesh (0: all). The rest take their nearest one's."""
     seed: int = 0
+    rays: Literal["auto", "embree", "jax"] = "auto"
+    """Who casts them: Embree on the CPU, or the tree in JAX on its device. `auto`: Embree unless JAX has a GPU."""
 
     def __post_init__(self) -> None:
+        check_one_of("rays", self.rays, ("auto", "embree", "jax"))
         check_at_least("frames_per_second", self.frames_per_second, 0.1)
         check_at_least("max_frames", self.max_frames, 2)
         check_at_least("num_directions", self.num_directions, 16)

@@ -25,7 +25,7 @@ from jaxrender.animation.skeleton import global_matrices
 from jaxrender.animation.skinning import Character, skin_mesh
 from jaxrender.checks import bad_input, check_finite
 from jaxrender.console import announce
-from jaxrender.harmonics.visibility import hemisphere_directions, trace_visibility
+from jaxrender.harmonics.visibility import VisibilityCaster, hemisphere_directions
 from jaxrender.scene import MeshSequence
 
 STORE_VERSION = 2
@@ -218,14 +218,14 @@ def bake(
       track: wraps the iteration over frames, for progress display.
     """
     directions = hemisphere_directions(settings.num_directions)
-    faces = np.asarray(faces)
+    caster = VisibilityCaster(np.asarray(faces), directions, points=points, rays=settings.rays)
     missing = store.missing()
     started, total = time.perf_counter(), store.num_frames
     for index in track(iter(missing), len(missing)):
         positions, frames = frame(int(index))
         if not (np.isfinite(positions).all() and np.isfinite(frames).all()):
             bad_input(f"frame {index}", "vertices", expected="finite numbers", got="NaN or Inf after skinning")
-        store.write(int(index), trace_visibility(positions, frames, faces, directions, points=points))
+        store.write(int(index), caster.cast(positions, frames))
     seconds = time.perf_counter() - started
     return BakeStatistics(len(missing) * len(points) * settings.num_directions, seconds, total - len(missing))
 

@@ -233,6 +233,8 @@ class Trace(SceneView):
     """Soft shadows: unshadowed light times a filtered ratio, or plain samples. By default the ratio up to 31 rays."""
     model: Literal["metallic_roughness", "phong", "lambert"] = "metallic_roughness"
     """How surfaces reflect."""
+    rays: Literal["auto", "embree", "jax"] = "auto"
+    """Who traces rays: Embree on the CPU, or the tree in JAX on its device. By default Embree unless JAX has a GPU."""
     environment: Path | None = None
     """A lat-long .hdr or .exr map that lights the scene, beside the lights of the file."""
     time: float | None = None

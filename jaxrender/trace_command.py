@@ -15,7 +15,8 @@ from jaxrender.checks import bad_input
 from jaxrender.io import read_environment, write_exr, write_png
 from jaxrender.io.frames import frame_name, numbered_name
 from jaxrender.io.picture import tone_map
-from jaxrender.machine import is_writable_folder, num_cores
+from jaxrender.machine import is_writable_folder
+from jaxrender.pathtrace.backends import chosen_backend, told_backend
 from jaxrender.pathtrace.guide_rays import pooled, trace_guides
 from jaxrender.pathtrace.render import Rendered, combine, filter_incident, render
 from jaxrender.pathtrace.settings import TraceSettings
@@ -35,9 +36,9 @@ def run_trace(options: "Trace") -> None:
         bad_input("-o", str(out.parent), expected="a folder that can be written", got="one that cannot")
     scene, camera = open_view(options)
     environment = None if options.environment is None else read_environment(options.environment)
-    console.announce_device(rays=f"Embree, {num_cores()} threads")
+    console.announce_device(rays=told_backend(chosen_backend(options.rays)))
     started = time.perf_counter()
-    world = prepare(scene, environment=environment)
+    world = prepare(scene, environment=environment, rays=options.rays)
     for note in world.notes:
         console.announce(f"{scene.name}: {note}")
     console.announce(f"{len(scene.faces)} triangles ready after {time.perf_counter() - started:.1f} s")

@@ -53,6 +53,17 @@ def test_frames_go_round_and_time_is_kept(folder, capsys):
     assert "1 samples a pixel" in err and (folder / "t.png").is_file()
 
 
+def test_rays_by_the_tree(folder, capsys):
+    """The same picture, and the command says who traces; no bounces and no filter, so that little is compiled."""
+    plain = ["--size", "16", "12", "--spp", "1", "--bounces", "0", "--direct", "plain"]
+    pictures = []
+    for rays, told in (("embree", "rays: Embree, "), ("jax", "rays: tree in JAX, cpu")):
+        assert cli.main(["trace", "-o", f"{rays}.png", "--rays", rays, *plain]) == 0
+        assert told in capsys.readouterr().err
+        pictures.append(read_png(folder / f"{rays}.png"))
+    assert (np.abs(pictures[0] - pictures[1]) < 0.01).all(axis=-1).mean() > 0.98
+
+
 @pytest.mark.parametrize(
     ("options", "line"),
     [

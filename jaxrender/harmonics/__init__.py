@@ -37,6 +37,7 @@ from jaxrender.harmonics.sh import sh_product as sh_product
 from jaxrender.harmonics.sh import sh_project as sh_project
 from jaxrender.harmonics.sh import sh_rotate as sh_rotate
 from jaxrender.harmonics.sh import sh_to_layout as sh_to_layout
+from jaxrender.harmonics.visibility import VisibilityCaster as VisibilityCaster
 from jaxrender.harmonics.visibility import hemisphere_directions as hemisphere_directions
 from jaxrender.harmonics.visibility import project_visibility as project_visibility
 from jaxrender.harmonics.visibility import projection_table as projection_table

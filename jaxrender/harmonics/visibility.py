@@ -7,13 +7,18 @@ shading truth all follow from the bits by one small matrix product, which alone 
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from jaxrender.checks import bad_input, check_at_least, check_finite, check_last_axis
 from jaxrender.harmonics.sh import basis_columns
+from jaxrender.pathtrace.backends import RayBackend, chosen_backend, on_the_device
+from jaxrender.pathtrace.bvh import Bvh, build_bvh, update_bvh
 from jaxrender.pathtrace.embree import RAYS_PER_TASK, EmbreeScene, pool
+from jaxrender.pathtrace.traversal import any_hit
+from jaxrender.pathtrace.wavefront import plan_for_backend
 from jaxrender.vecmath import matmul
 
 # Distance of a ray's origin from its vertex, as a share of the mesh's diagonal. At 0 nearly every ray hits
@@ -62,23 +67,71 @@ def trace_visibility(
       InputError: if a position or a frame is not finite, or a face names a vertex that is not there.
       ValueError: if there is no direction, or one has not three components.
     """
-    check_last_axis("directions", directions, 3)
-    check_at_least("number of directions", len(directions), 1)
+    caster = VisibilityCaster(faces, directions, points=points, relative_offset=relative_offset)
+    return caster.cast(positions, frames)
+
+
+class VisibilityCaster:
+    """`trace_visibility` for one mesh in many poses, by either ray backend.
+
+    Embree builds its scene for each pose. The tree in JAX is kept and refitted (`update_bvh`); there, rays are made,
+    traced and packed on the device, and only bits are fetched. The backends agree but for rays within rounding of an
+    edge.
+    """
+
+    def __init__(
+        self,
+        faces: Int[np.ndarray, "t 3"],
+        directions: Float[np.ndarray, "d 3"],
+        *,
+        points: Int[np.ndarray, " p"] | None = None,
+        relative_offset: float = RELATIVE_OFFSET,
+        rays: RayBackend = "auto",
+    ):
+        """Takes what `trace_visibility` takes, and who traces the rays (`chosen_backend`).
+
+        Raises:
+          ValueError: if there is no direction, one has not three components, or there is no such backend.
+        """
+        check_last_axis("directions", directions, 3)
+        check_at_least("number of directions", len(directions), 1)
+        self._faces, self._points, self._relative_offset = np.asarray(faces), points, relative_offset
+        self._directions = np.ascontiguousarray(directions, np.float32)
+        self._backend = chosen_backend(rays)
+        self._tree: Bvh | None = None
+
+    def cast(
+        self, positions: Float[np.ndarray, "v 3"], frames: Float[np.ndarray, "v 3 3"]
+    ) -> UInt8[np.ndarray, "p bytes"]:
+        """The bits of one pose; see `trace_visibility`."""
+        _check_mesh(positions, frames, self._faces)
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        centred = (positions - 0.5 * (low + high)).astype(np.float32)
+        points = np.arange(len(positions)) if self._points is None else self._points
+        offset = np.float32(self._relative_offset * np.linalg.norm(high - low))
+        origins = centred[points] + offset * frames[points, :, 2].astype(np.float32)
+        world_from_local = np.ascontiguousarray(frames[points], np.float32)
+        if self._backend == "embree":
+            return _cast_by_embree(EmbreeScene(centred, self._faces), origins, world_from_local, self._directions)
+        tree = build_bvh(centred, self._faces) if self._tree is None else update_bvh(self._tree, centred)
+        self._tree = tree
+        return _cast_by_tree(tree, origins, world_from_local, self._directions)
+
+
+def _check_mesh(positions: np.ndarray, frames: np.ndarray, faces: np.ndarray) -> None:
     check_finite("mesh", "positions", positions)
     check_finite("mesh", "frames", frames)
     # Embree reads whatever an index points to.
     if len(faces) and not 0 <= faces.min() <= faces.max() < len(positions):
         got = f"{faces.min()}..{faces.max()}"
         bad_input("mesh", "faces", expected=f"indices from 0 to {len(positions) - 1}", got=got)
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    centred = (positions - 0.5 * (low + high)).astype(np.float32)
-    scene = EmbreeScene(centred, faces)
-    points = np.arange(len(positions)) if points is None else points
-    offset = np.float32(relative_offset * np.linalg.norm(high - low))
-    origins = centred[points] + offset * frames[points, :, 2].astype(np.float32)
-    world_from_local = np.ascontiguousarray(frames[points], np.float32)
-    local = np.ascontiguousarray(directions, np.float32)
-    bits = np.empty((len(points), -(-len(local) // 8)), np.uint8)
+
+
+def _cast_by_embree(
+    scene: EmbreeScene, origins: np.ndarray, world_from_local: np.ndarray, local: np.ndarray
+) -> UInt8[np.ndarray, "p bytes"]:
+    """A task of rays on each core at a time."""
+    bits = np.empty((len(origins), -(-len(local) // 8)), np.uint8)
     step = max(1, RAYS_PER_TASK // len(local))
 
     def task(start: int) -> None:
@@ -88,8 +141,35 @@ def trace_visibility(
         free = scene.run(starts, rays.reshape(-1, 3), "OCCLUDED") < 0
         bits[span] = np.packbits(free.reshape(-1, len(local)), axis=1)
 
-    list(pool().map(task, range(0, len(points), step)))
+    list(pool().map(task, range(0, len(origins), step)))
     return bits
+
+
+def _cast_by_tree(
+    tree: Bvh, origins: np.ndarray, world_from_local: np.ndarray, local: np.ndarray
+) -> UInt8[np.ndarray, "p bytes"]:
+    """As many points at a time as a task has rays, or as fill a GPU; the last ones are filled up with the first."""
+    num_rays = RAYS_PER_TASK if jax.default_backend() == "cpu" else plan_for_backend().block
+    step = min(max(1, num_rays // len(local)), max(1, len(origins)))
+
+    def task(start: int) -> np.ndarray:
+        own = np.arange(start, start + step) % len(origins)
+        return np.asarray(_free_bits(tree, origins[own], world_from_local[own], local))
+
+    found = list(on_the_device(task, range(0, len(origins), step)))
+    none = np.zeros((0, -(-len(local) // 8)), np.uint8)
+    return np.concatenate([none, *found])[: len(origins)]
+
+
+@jax.jit
+def _free_bits(
+    tree: Bvh, origins: Float[Array, "p 3"], world_from_local: Float[Array, "p 3 3"], local: Float[Array, "d 3"]
+) -> UInt8[Array, "p bytes"]:
+    """Packed visibility of all directions from each point."""
+    count = len(local)
+    directions = matmul(local[None], jnp.swapaxes(world_from_local, 1, 2)).reshape(-1, 3)
+    blocked = any_hit(tree, jnp.repeat(origins, count, axis=0), directions)
+    return jnp.packbits(~blocked.reshape(-1, count), axis=1)
 
 
 def projection_table(directions: Float[np.ndarray, "d 3"], *, order: int) -> Float[np.ndarray, "d k"]:

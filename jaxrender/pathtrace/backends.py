@@ -15,7 +15,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def chosen_backend(rays: RayBackend = "auto") -> Literal["embree", "jax"]:
+def chosen_backend(rays: RayBackend) -> Literal["embree", "jax"]:
     """ "auto" is Embree where JAX runs on the CPU, and the tree elsewhere: data then stay on the device.
 
     Raises:

@@ -163,7 +163,7 @@ def _search(nodes: Nodes, origins, directions, limit, accept, *, depth: int, sto
 
     def step(state: State) -> State:
         rays, search = state.each
-        search = tested_leaf(nodes, rays, search, accept)
+        search = tested_leaf(nodes, rays, search, accept=accept)
         if stop_at_first:
             search = stopped(search, search.found >= 0)
         search, stack = visited_node(nodes, rays, search, state.stack)
@@ -201,7 +201,7 @@ def stopped(search: Search, stop: Bool[Array, " k"]) -> Search:
     return search._replace(group=group, leaves=leaves, height=height)
 
 
-def tested_leaf(nodes: Nodes, rays: Rays, search: Search, accept: Accept | None = None) -> Search:
+def tested_leaf(nodes: Nodes, rays: Rays, search: Search, *, accept: Accept | None = None) -> Search:
     """The search after the triangles of the next leaf, for rays that have one."""
     some = search.leaves != 0
     leaf = jnp.where(some, ~next_child(nodes, search.leaves, rays.octant), 0)

@@ -251,6 +251,22 @@ def test_points_choose_rows(two_balls):
     assert none.shape == (0, NUM_DIRECTIONS // 8)
 
 
+def test_the_tree_gives_the_bits_of_embree_also_refitted_and_in_chunks(two_balls, monkeypatch):
+    """But for rays that graze an edge."""
+    positions, frames, faces = two_balls
+    points, directions = np.arange(0, len(positions), 3), harmonics.hemisphere_directions(20)
+    monkeypatch.setattr(module, "RAYS_PER_TASK", 1000)
+    casters = [harmonics.VisibilityCaster(faces, directions, points=points, rays=rays) for rays in ("embree", "jax")]
+    for squeeze in (1.0, 0.8, 0.9):
+        pose = positions * np.array([1.0, 1.0, squeeze])
+        theirs, ours = (np.unpackbits(caster.cast(pose, frames), axis=1, count=20) for caster in casters)
+        assert 0.05 < 1.0 - theirs.mean() < 0.6
+        assert (ours != theirs).mean() < 1e-3
+    assert len(casters[1].cast(positions, frames)) == len(points)
+    with pytest.raises(ValueError, match="rays: expected one of auto, embree, jax, got gpu"):
+        harmonics.VisibilityCaster(faces, directions, rays="gpu")
+
+
 @pytest.mark.parametrize("rays_per_task", [1, 1000, 1 << 20])
 def test_memory_is_bounded_by_the_chunk_not_the_mesh(rays_per_task, two_balls, monkeypatch):
     positions, frames, faces = two_balls

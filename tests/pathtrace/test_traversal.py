@@ -55,6 +55,25 @@ def test_hits_from_max_distance_on_do_not_count(soup):
     np.testing.assert_array_equal(hit, t < limit)
 
 
+def _is_of_even_face(leaf_faces, place, barycentrics):
+    inside = (barycentrics >= -1e-3).all(axis=-1) & (barycentrics.sum(axis=-1) <= 1.001)
+    return (place >= 0) & inside & (leaf_faces[jnp.maximum(place, 0)] % 2 == 0)
+
+
+def test_hits_that_are_not_accepted_are_passed(soup):
+    """As if the other half of the faces were not there."""
+    vertices, faces, origins, directions = soup
+    bvh = build_bvh(vertices, faces)
+    accept = jax.tree_util.Partial(_is_of_even_face, bvh.leaf_faces.reshape(-1))
+    face, t, _ = brute_force(vertices, faces[::2], origins, directions)
+    o, d = jnp.asarray(origins, jnp.float32), jnp.asarray(directions, jnp.float32)
+    hits = closest_hit(bvh, o, d, accept=accept)
+    assert 25 < (face >= 0).sum() < 225
+    np.testing.assert_array_equal(hits.triangle, np.where(face >= 0, 2 * face, -1))
+    np.testing.assert_allclose(hits.t, t, atol=4 * EPS / 0.01)
+    np.testing.assert_array_equal(any_hit(bvh, o, d, accept=accept), face >= 0)
+
+
 def test_max_distance_is_open():
     """At t = 2 exactly, and the values that mean nothing."""
     bvh = build_bvh(np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))

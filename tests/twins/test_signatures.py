@@ -65,6 +65,7 @@ EXCEPTIONS = {
     "harmonics.sh.sphere_quadrature": "torchref keeps its rules in a private file",
     "harmonics.zh_fit.greedy_axes": "where jaxrender starts its search; the twin starts from a grid",
     "harmonics.zh_fit.spread_start_axes": "the same",
+    "harmonics.visibility.VisibilityCaster": "runs on the host: which rays are cast by whom",
     "harmonics.pose_model.model_arrays": "jaxrender writes and checks files; the twin only loads",
     "harmonics.pose_model.read_model_file": "the same",
     "harmonics.pose_model.model_hash": "the same",
