@@ -1,23 +1,27 @@
 """The path tracer: the paper's render times, rays beside Mitsuba, filters of its own indirect light, soft shadows.
 
-On one thread per block of pixels, as the command runs. Scenes are those of `path_scenes`, matt. Cases:
+As the command runs: Embree and one thread per block of pixels, or the tree in JAX where JAX has a GPU. Scenes are those
+of `path_scenes`, matt. Cases:
 
 - `table1`: bounces and samples of table 1 of Bauszat et al. 2011 at 1024 x 768: `traced` are the guide rays with their
   light, `whole` is the picture with filter and all eye rays. `rays_per_second` counts rays that were traced.
+- `backends`: the guide rays of the first row of that table by Embree and by the tree in JAX, in turns; at 256 x 192 on
+  a CPU. `differing_share` is that of pixels whose light is another.
 - `mitsuba`: direct light and two bounces for one sample a pixel, traced by both libraries in turns; one light of each
   kind for ours, one light of all for Mitsuba. `time_ratio` is Mitsuba's time over ours.
-- `rays`: 131,072 rays through Sponza, one thread: Embree, and the tree in pure JAX.
+- `rays`: 131,072 rays through Sponza on one thread of a CPU, 1,048,576 on a GPU: Embree, and the tree in pure JAX.
 - `quality`, `final`, `figures`: see `path_quality`.
 """
 
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.path_quality import figures, final, quality
@@ -27,9 +31,12 @@ from benchmarks.suites import Measurement, Options
 from benchmarks.timing import measure_alternating
 from jaxrender import console
 from jaxrender.camera import camera_rays
-from jaxrender.pathtrace import Bvh, EmbreeScene, TraceSettings, World, build_bvh, render, trace_rays
+from jaxrender.pathtrace import Bvh, EmbreeScene, TraceSettings, World, build_bvh, prepare, render, trace_rays
+from jaxrender.pathtrace.backends import chosen_backend
 from jaxrender.pathtrace.guide_rays import trace_guides
 from jaxrender.pathtrace.ray_scene import RayScene
+
+BACKENDS: tuple[Literal["embree", "jax"], ...] = ("embree", "jax")
 
 Params = dict[str, str | int | float | bool]
 
@@ -41,18 +48,17 @@ class Sizes:
     scenes: tuple[str, ...] = ("cornell", "statue", "atrium", "sponza")
     table: tuple[int, int] = (768, 1024)
     table_rows: tuple[tuple[int, int], ...] = ((1, 1), (1, 4), (2, 4))
+    table_of_tree: tuple[int, int] = (192, 256)
     num_rays: int = 1 << 17
+    num_rays_gpu: int = 1 << 20
     min_runs: int = 3
 
 
 FULL = Sizes()
 QUICK = Sizes(
-    scenes=("cornell",),
-    table=(48, 64),
-    table_rows=((1, 1),),
-    num_rays=1 << 12,
-    min_runs=1,
-)
+    scenes=("cornell",), table=(48, 64), table_rows=((1, 1),), table_of_tree=(48, 64), num_rays=1 << 12,
+    num_rays_gpu=1 << 12, min_runs=1,
+)  # fmt: skip
 
 
 def run(options: Options) -> Iterator[Measurement]:
@@ -103,7 +109,7 @@ def _table1(sizes: Sizes, options: Options) -> Iterator[Measurement]:
             calls = {"traced": traced, "whole": whole}
             params: Params = {
                 "scene": name, "triangles": len(stage.scene.faces), "bounces": bounces, "spp": spp, "height": height,
-                "width": width,
+                "width": width, "rays": chosen_backend("auto"),
             }  # fmt: skip
             for key, timing in measure_alternating(calls, min_runs=sizes.min_runs, min_seconds=0.0).items():
                 counted = _Counted(world.rays)
@@ -114,6 +120,34 @@ def _table1(sizes: Sizes, options: Options) -> Iterator[Measurement]:
                     "rays_per_second": counted.count / (1e-3 * timing.ms_median),
                 }  # fmt: skip
                 yield Measurement("table1", key, metrics, params)
+
+
+def _backends(sizes: Sizes, options: Options) -> Iterator[Measurement]:
+    height, width = sizes.table_of_tree if jax.default_backend() == "cpu" else sizes.table
+    bounces, spp = sizes.table_rows[0]
+    settings = TraceSettings(bounces=bounces, samples_per_pixel=spp, model="lambert", seed=options.seed)
+    for name in sizes.scenes:
+        stage, _ = open_stage(name)
+        worlds = {rays: prepare(stage.scene, environment=stage.environment, rays=rays) for rays in BACKENDS}
+        trace = functools.partial(trace_guides, camera=stage.camera, height=height, width=width, settings=settings)
+        calls: dict[str, Callable[[], None]] = {
+            rays: functools.partial(_discard, trace, world) for rays, world in worlds.items()
+        }
+        times = measure_alternating(calls, min_runs=sizes.min_runs, min_seconds=0.0)
+        counted = _Counted(worlds["embree"].rays)
+        truth = trace(dataclasses.replace(worlds["embree"], rays=counted)).color
+        params: Params = {"scene": name, "bounces": bounces, "spp": spp, "height": height, "width": width}
+        for rays, world in worlds.items():
+            timing = times[rays]
+            differ = np.abs(trace(world).color - truth) > 1e-4 + 1e-3 * truth
+            metrics = {**timing.metrics(), "rays_per_second": counted.count / (1e-3 * timing.ms_median),
+                       "differing_share": float(differ.any(axis=-1).mean())}  # fmt: skip
+            yield Measurement("backends", rays, metrics, params)
+
+
+def _discard(trace: Callable[[World], object], world: World) -> None:
+    """Images are NumPy arrays: there is nothing left to wait for."""
+    trace(world)
 
 
 def _mitsuba(sizes: Sizes, options: Options) -> Iterator[Measurement]:
@@ -156,7 +190,7 @@ def _mitsuba(sizes: Sizes, options: Options) -> Iterator[Measurement]:
 def _rays(sizes: Sizes, options: Options) -> Iterator[Measurement]:
     """Primary rays, cosine-free random ones from where those end, and the same as shadow rays."""
     stage, _ = open_stage("sponza" if "sponza" in sizes.scenes else sizes.scenes[0])
-    side = int(sizes.num_rays**0.5)
+    side = int((sizes.num_rays if jax.default_backend() == "cpu" else sizes.num_rays_gpu) ** 0.5)
     origins, directions = (
         np.ascontiguousarray(np.asarray(x).reshape(-1, 3)) for x in camera_rays(stage.camera, height=side, width=side)
     )
@@ -175,16 +209,18 @@ def _rays(sizes: Sizes, options: Options) -> Iterator[Measurement]:
         ("shadow", (bounced, loose), "any"),
     )
     for kind, rays, query in kinds:
-        calls = {name: functools.partial(_ask, backend, rays, query) for name, backend in backends.items()}
+        # Rays of the tree lie on its device, as those of the renderer do.
+        own = {"embree": rays, "jax": tuple(jnp.asarray(x) for x in rays)}
+        calls = {name: functools.partial(_ask, backend, own[name], query) for name, backend in backends.items()}
         for name, timing in measure_alternating(calls, min_runs=sizes.min_runs, min_seconds=0.0).items():
             metrics = {"ms_median": timing.ms_median, "compile_ms": timing.compile_ms,
                        "rays_per_second": len(origins) / (1e-3 * timing.ms_median)}  # fmt: skip
             yield Measurement("rays", name, metrics, {"kind": kind, "rays": len(origins), "triangles": len(faces)})
 
 
-def _ask(backend: EmbreeScene | Bvh, rays: tuple[np.ndarray, np.ndarray], query: Literal["closest", "any"]) -> None:
+def _ask(backend: EmbreeScene | Bvh, rays: tuple, query: Literal["closest", "any"]) -> None:
     jax.block_until_ready(trace_rays(backend, *rays, query=query))
 
 
-CASES = {"table1": _table1, "mitsuba": _mitsuba, "rays": _rays}
+CASES = {"table1": _table1, "backends": _backends, "mitsuba": _mitsuba, "rays": _rays}
 QUALITY = {"quality": quality, "final": final, "figures": figures}

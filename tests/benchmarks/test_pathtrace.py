@@ -23,7 +23,7 @@ def made(shared_data, tmp_path_factory):
         ways = {name: denoising.WAYS[name] for name in WAYS}
         patch.setattr(denoising, "WAYS", ways)
         patch.setattr(path_quality, "WAYS", ways)
-        cases = ("table1", "rays", "quality", "final", "figures")
+        cases = ("table1", "backends", "rays", "quality", "final", "figures")
         return list(pathtrace.run(Options(cases=cases, quick=True))), folder
 
 
@@ -32,11 +32,13 @@ def test_rows_are_complete_and_finite(made):
     rows, _ = made
     names = [(row.case, row.variant) for row in rows]
     assert names == [
-        ("table1", "traced"), ("table1", "whole"), *[("rays", "embree"), ("rays", "jax")] * 3,
+        ("table1", "traced"), ("table1", "whole"), ("backends", "embree"), ("backends", "jax"),
+        *[("rays", "embree"), ("rays", "jax")] * 3,
         *[("quality", name) for name in WAYS] * 2, ("final", "plain"), ("final", "ratio"),
         *(("figures", f"figure{number}") for number in (2, 5, 6, 7, 8)),
     ]  # fmt: skip
     assert all(math.isfinite(value) for row in rows for value in row.metrics.values())
+    assert all(row.metrics["differing_share"] < 0.02 for row in rows if row.case == "backends")
 
 
 @pytest.mark.data
