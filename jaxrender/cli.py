@@ -239,10 +239,20 @@ class Trace(SceneView):
     """A lat-long .hdr or .exr map that lights the scene, beside the lights of the file."""
     time: float | None = None
     """Instead of --spp: seconds; the picture is written again each time its samples have doubled."""
+    ground: bool = False
+    """Put a matt plane under the scene, at the lowest point of its motion."""
     frames: int = 1
-    """Number of frames; more than one wants --orbit-degrees."""
+    """Number of frames; more than one wants --clip, --orbit-degrees, --turn-light-degrees or --new-seeds."""
+    clip: str | None = None
+    """Name or number of a clip of the file, to be played, over and over; one that is not there lists those that are."""
+    fps: float = 24.0
+    """With --clip: frames per second."""
+    start_seconds: float = 0.0
+    """With --clip: the clip's time in the first frame."""
     orbit_degrees: float = 0.0
     """How far the camera goes round what it looks at, over all frames."""
+    turn_light_degrees: float = 0.0
+    """How far sun and environment turn about the vertical, over all frames."""
     seed: int = 0
     """Of all random numbers: the same for all frames, as still noise disturbs less."""
     new_seeds: bool = False
@@ -275,10 +285,17 @@ class Trace(SceneView):
             raise ValueError(f"--bounces: expected at most 64, got {self.bounces}")
         if self.time is not None and self.frames > 1:
             raise ValueError("--time: expected it without --frames")
-        if not math.isfinite(self.orbit_degrees) or (self.frames > 1 and not self.orbit_degrees):
-            raise ValueError(
-                f"--orbit-degrees: expected a number that is not 0 with --frames, got {self.orbit_degrees}"
-            )
+        for name, number in (("orbit-degrees", self.orbit_degrees), ("turn-light-degrees", self.turn_light_degrees)):
+            if not math.isfinite(number):
+                raise ValueError(f"--{name}: expected a finite number, got {number}")
+        if not 0.0 < self.fps < math.inf:
+            raise ValueError(f"--fps: expected a finite number above 0, got {self.fps}")
+        if not 0.0 <= self.start_seconds < math.inf:
+            raise ValueError(f"--start-seconds: expected a finite number >= 0, got {self.start_seconds}")
+        moves = self.clip is not None or self.orbit_degrees or self.turn_light_degrees or self.new_seeds
+        if self.frames > 1 and not moves:
+            expected = "--clip, --orbit-degrees, --turn-light-degrees or --new-seeds beside it"
+            raise ValueError(f"--frames: expected {expected}, got none, so that all frames would be one picture")
         if not -64.0 <= self.exposure_stops <= 64.0:
             raise ValueError(f"--exposure-stops: expected a number from -64 to 64, got {self.exposure_stops}")
 

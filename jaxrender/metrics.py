@@ -6,7 +6,7 @@ encoding where you report them. All but `ssim` and `flip` are pure and different
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxrender import checks, vecmath
 from jaxrender.srgb import decode_srgb
@@ -44,6 +44,55 @@ def relative_l2(values: Float[Array, "*b"], reference: Float[Array, "*b"]) -> Fl
     return vecmath.safe_div(
         vecmath.safe_sqrt(jnp.sum(difference * difference)), vecmath.safe_sqrt(jnp.sum(reference * reference))
     )
+
+
+def flicker(frames: Float[Array, "f h w c"]) -> Float[Array, ""]:
+    """How much the noise of one still view changes from frame to frame: the mean over all values of their variance.
+
+    The variance is that of the population (over f - 1), in the square of the values' unit; display-encoded values in
+    0 to 255 give the `flicker_255` of the benchmarks. The frames have the same camera and scene, and other seeds.
+
+    Raises:
+      ValueError: if there are fewer than two frames.
+    """
+    checks.check_at_least("frames: number", len(frames), 2)
+    apart = frames - jnp.mean(frames, axis=0, keepdims=True)
+    return jnp.sum(apart * apart) / ((len(frames) - 1) * max(frames[0].size, 1))
+
+
+def warped_flicker(
+    image: Float[Array, "h w c"],
+    previous: Float[Array, "h w c"],
+    *,
+    places_px: Float[Array, "h w 2"],
+    matches: Bool[Array, "h w"],
+) -> Float[Array, ""]:
+    """How much an animation changes where it shows the same surface again: the RMS of the differences of two frames.
+
+    The frame before is looked up where the surface of each pixel was then, bilinearly; for a still view with
+    independent noise the result is √(2 `flicker`). True changes count as well: highlights, and shadows that wander. In
+    the values' unit; 0 where nothing matches. Differentiable in the images.
+
+    Args:
+      places_px: where in `previous` the surface was (x, y), pixel centres at +0.5.
+      matches: whether it is seen there, in all four pixels around; others do not count.
+    Raises:
+      ValueError: if the images differ in shape.
+    """
+    checks.check_same_shape("image and previous", image, previous)
+    height, width = image.shape[:2]
+    places = jnp.where(matches[..., None], places_px, jnp.full_like(places_px, 0.5)) - 0.5
+    whole = jnp.floor(places)
+    before = jnp.zeros_like(image)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            offset = whole + jnp.asarray([dx, dy], whole.dtype).reshape(1, 1, 2)
+            weight = jnp.prod(1.0 - jnp.abs(places - offset), axis=-1, keepdims=True)
+            column, row = (jnp.clip(offset[..., k], 0, size - 1).astype(int) for k, size in ((0, width), (1, height)))
+            before = before + weight.astype(image.dtype) * previous[row, column]
+    difference = jnp.where(matches[..., None], image - before, jnp.zeros_like(image))
+    count = jnp.maximum(jnp.sum(matches), 1).astype(image.dtype) * image.shape[-1]
+    return vecmath.safe_sqrt(jnp.sum(difference * difference) / count)
 
 
 def ssim(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxrender import console
 from jaxrender.camera import Camera
@@ -134,8 +135,8 @@ def open_view(options: "SceneView") -> tuple[Scene, Camera]:
     return scene, choose_camera(scene, options)
 
 
-def choose_camera(scene: Scene, options: "SceneView") -> Camera:
-    """The camera of the options, else of the file, else one that sees the whole scene from outside."""
+def choose_camera(scene: Scene, options: "SceneView", *, bounds: tuple[Array, Array] | None = None) -> Camera:
+    """The camera of the options, else of the file, else one that sees the whole scene, or `bounds`, from outside."""
     if options.eye is not None:
         eye, target = (jnp.asarray(v, jnp.float32) for v in (options.eye, options.target))
         up = [0.0, 0.0, -1.0] if np.allclose(options.eye[::2], options.target[::2]) else [0.0, 1.0, 0.0]
@@ -143,7 +144,7 @@ def choose_camera(scene: Scene, options: "SceneView") -> Camera:
     if options.inside:
         return inside_camera(scene, fov_y_radians=math.radians(options.fov_degrees))
     if not scene.cameras and options.camera == 0:
-        return whole_scene_camera(scene, aspect=options.size[0] / options.size[1])
+        return whole_scene_camera(scene, aspect=options.size[0] / options.size[1], bounds=bounds)
     if options.camera >= len(scene.cameras):
         bad_input("--camera", scene.name, expected=f"one of {len(scene.cameras)} cameras", got=options.camera)
     return scene.cameras[options.camera]

@@ -1,6 +1,6 @@
 """What goes into the methods: meshes, meshes that move, and scenes with materials, lights and cameras."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -160,12 +160,57 @@ def scene_bounds(scene: Scene) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
 
 
 def whole_scene_camera(
-    scene: Scene, *, aspect: int | float = 1.0, azimuth_radians: float = 0.6, elevation_radians: float = 0.35
-) -> Camera:
-    """A camera outside the scene that sees all of it, from the right and above; the angles as in `frame_bounds`."""
-    return frame_bounds(
-        *scene_bounds(scene), azimuth_radians=azimuth_radians, elevation_radians=elevation_radians, aspect=aspect
-    )
+    scene: Scene, *, aspect: int | float = 1.0, azimuth_radians: float = 0.6, elevation_radians: float = 0.35,
+    bounds: tuple[Float[Array, "3"], Float[Array, "3"]] | None = None,
+) -> Camera:  # fmt: skip
+    """A camera outside the scene that sees all of it, from the right and above; the angles as in `frame_bounds`.
+
+    Args:
+      bounds: the box to be seen, of all poses for example; None is that of the scene.
+    """
+    low, high = scene_bounds(scene) if bounds is None else bounds
+    return frame_bounds(low, high, azimuth_radians=azimuth_radians, elevation_radians=elevation_radians, aspect=aspect)
+
+
+def with_ground(
+    scene: Scene, low: Float[Array, "3"], high: Float[Array, "3"], *, width: float = 40.0, color: float = 0.3
+) -> Scene:
+    """The scene on a level matt plane, for a character that comes without one. Not for use inside `jit`.
+
+    The plane is the last two triangles and the last material. It passes through `low`.
+
+    Args:
+      low, high: the box around the scene, or around all its poses; the plane lies under its middle.
+      width: of the plane, over the diagonal of that box.
+      color: its reflectance.
+    """
+    low, high = (np.asarray(corner, np.float64) for corner in (low, high))
+    half = 0.5 * width * (float(np.linalg.norm(high - low)) or 1.0)
+    x, z = 0.5 * (low + high)[[0, 2]]
+    signs = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+    corners = np.stack([x + half * signs[:, 0], np.full(4, low[1]), z + half * signs[:, 1]], axis=1)
+    row = lambda *numbers: np.tile(np.array(numbers, np.float32), (4, 1))  # noqa: E731
+    added = {
+        "positions": corners.astype(np.float32), "normals": row(0, 1, 0), "tangents": row(1, 0, 0, 1),
+        "uv": row(0, 0), "colors": row(1, 1, 1, 1),
+        "faces": len(scene.positions) + np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        "material_id": np.full(2, len(scene.material.metallic), np.int32),
+    }  # fmt: skip
+    below = {name: jnp.concatenate([getattr(scene, name), rows]) for name, rows in added.items()}
+    material = jax.tree.map(lambda own, new: jnp.concatenate([own, new[None]]), scene.material, _matt(color))
+    return replace(scene, **below, material=material, material_names=(*scene.material_names, "ground"))
+
+
+def _matt(color: float) -> Material:
+    """One material without textures or gloss."""
+    number, none = (lambda x: jnp.asarray(x, jnp.float32)), jnp.asarray(-1, jnp.int32)
+    return Material(
+        base_color=number([color, color, color, 1.0]), metallic=number(0.0), roughness=number(1.0),
+        emissive=number([0.0, 0.0, 0.0]), normal_scale=number(1.0), occlusion_strength=number(1.0),
+        alpha_mode=jnp.asarray(OPAQUE, jnp.int32), alpha_cutoff=number(0.5), double_sided=jnp.asarray(False),
+        base_color_texture=none, metallic_roughness_texture=none, normal_texture=none, occlusion_texture=none,
+        emissive_texture=none,
+    )  # fmt: skip
 
 
 def inside_camera(scene: Scene, *, fov_y_radians: float = 1.05) -> Camera:

@@ -1,27 +1,32 @@
 """`jaxrender trace`: loads a scene, traces a picture or several, writes them as they get better."""
 
 import dataclasses
-import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxrender import console
 from jaxrender.camera import Camera
 from jaxrender.checks import bad_input
-from jaxrender.io import read_environment, write_exr, write_png
+from jaxrender.io import write_exr, write_png
 from jaxrender.io.frames import frame_name, numbered_name
 from jaxrender.io.picture import tone_map
 from jaxrender.machine import is_writable_folder
+from jaxrender.metrics import warped_flicker
 from jaxrender.pathtrace.backends import chosen_backend, told_backend
 from jaxrender.pathtrace.guide_rays import pooled, trace_guides
 from jaxrender.pathtrace.render import Rendered, combine, filter_incident, render
+from jaxrender.pathtrace.reprojection import previous_places
 from jaxrender.pathtrace.settings import TraceSettings
-from jaxrender.pathtrace.world import World, prepare
-from jaxrender.render_command import open_view
+from jaxrender.pathtrace.world import World
+from jaxrender.scene import Scene
+from jaxrender.srgb import encode_srgb
+from jaxrender.trace_frames import Film, open_film
 
 if TYPE_CHECKING:
     from jaxrender.cli import Trace
@@ -34,19 +39,20 @@ def run_trace(options: "Trace") -> None:
     out = options.out.with_suffix(".png")
     if not is_writable_folder(out.parent):
         bad_input("-o", str(out.parent), expected="a folder that can be written", got="one that cannot")
-    scene, camera = open_view(options)
-    environment = None if options.environment is None else read_environment(options.environment)
+    film = open_film(options)
     console.announce_device(rays=told_backend(chosen_backend(options.rays)))
     started = time.perf_counter()
-    world = prepare(scene, environment=environment, rays=options.rays)
+    world = film.first_world()
     for note in world.notes:
-        console.announce(f"{scene.name}: {note}")
-    console.announce(f"{len(scene.faces)} triangles ready after {time.perf_counter() - started:.1f} s")
+        console.announce(f"{film.scene.name}: {note}")
+    console.announce(f"{len(film.scene.faces)} triangles ready after {time.perf_counter() - started:.1f} s")
     if options.time is not None:
-        paths, record = _progressive(options, world, camera, out)
+        paths, record = _progressive(options, world, film.view(0, film.scene), out)
+    elif options.frames == 1:
+        paths, record = _still(options, world, film.view(0, film.scene), out)
     else:
-        paths, record = _frames(options, world, camera, out)
-    console.finish(paths=paths, record={"triangles": len(scene.faces), **record}, as_json=options.json)
+        paths, record = _frames(options, world, film, out)
+    console.finish(paths=paths, record={"triangles": len(film.scene.faces), **record}, as_json=options.json)
 
 
 def _settings(options: "Trace", *, spp: int, seed: int) -> TraceSettings:
@@ -57,22 +63,65 @@ def _settings(options: "Trace", *, spp: int, seed: int) -> TraceSettings:
     )  # fmt: skip
 
 
-def _frames(options: "Trace", world: World, camera: Camera, out: Path) -> tuple[list[Path], dict]:
-    """All frames; those that are finished stay, whatever happens to the next."""
+def _still(options: "Trace", world: World, camera: Camera, out: Path) -> tuple[list[Path], dict]:
+    """One picture."""
+    width, height = options.size
+    started = time.perf_counter()
+    settings = _settings(options, spp=options.spp, seed=options.seed)
+    picture = render(world, camera, height=height, width=width, settings=settings)
+    seconds = time.perf_counter() - started
+    console.announce(_told(picture, options.spp))
+    return _write(picture, out, options), {"spp": options.spp, "seconds": seconds, **picture.chosen}
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """A frame that is finished, and what it showed."""
+
+    scene: Scene
+    camera: Camera
+    picture: Rendered
+
+
+def _frames(options: "Trace", first: World, film: Film, out: Path) -> tuple[list[Path], dict]:
+    """All frames, and how much they flicker; those that are finished stay, whatever happens to the next."""
     width, height = options.size
     paths: list[Path] = []
-    seconds = []
-    numbers = console.track(range(options.frames), "frames", total=options.frames)
-    for frame in numbers if options.frames > 1 else range(1):
-        started = time.perf_counter()
-        settings = _settings(options, spp=options.spp, seed=options.seed + frame * options.new_seeds)
-        view = orbit(camera, math.radians(options.orbit_degrees) * frame / options.frames)
-        picture = render(world, view, height=height, width=width, settings=settings)
-        seconds.append(time.perf_counter() - started)
-        name = out if options.frames == 1 else Path(frame_name(numbered_name(str(out)), frame + 1))
-        paths += _write(picture, name, options)
+    seconds, flickers, shares = [], [], []
+    before: _Shot | None = None
+    name = numbered_name(str(out))
+    for frame in console.track(range(options.frames), "frames", total=options.frames):
+        with console.keeping(f"{frame} of {options.frames} frames are finished and stay"):
+            started = time.perf_counter()
+            scene = film.pose(frame)
+            world = film.world(first, frame, scene) if frame else first
+            settings = _settings(options, spp=options.spp, seed=options.seed + frame * options.new_seeds)
+            camera = film.view(frame, scene)
+            picture = render(world, camera, height=height, width=width, settings=settings)
+            seconds.append(time.perf_counter() - started)
+            paths += _write(picture, Path(frame_name(name, frame + 1)), options)
+            now = _Shot(scene, camera, picture)
+            if before is not None:
+                found, share = _flicker(world, before, now, stops=options.exposure_stops)
+                flickers.append(found)
+                shares.append(share)
+            before = now
     console.announce(_told(picture, options.spp))
-    return paths, {"spp": options.spp, "seconds": seconds if options.frames > 1 else seconds[0], **picture.chosen}
+    mean, share = float(np.mean(flickers)), float(np.mean(shares))
+    console.announce(f"flicker {mean:.2f} of 255 from frame to frame, on the {100.0 * share:.0f} % seen in both")
+    record = {"spp": options.spp, "seconds": seconds, "flicker_rms_255": flickers, "seen_in_both": shares}
+    return paths, {**record, **({"clip": film.clip.name} if film.clip else {}), **picture.chosen}
+
+
+def _flicker(world: World, before: _Shot, now: _Shot, *, stops: float) -> tuple[float, float]:
+    """`warped_flicker` of display-encoded values in 0 to 255, and the share of the pixels that count."""
+    places, matches = previous_places(world, now.camera, before.scene, before.camera, before.picture.guides)
+    image, previous = (
+        jnp.asarray(255.0 * encode_srgb(np.clip(shot.picture.image * np.float32(2.0**stops), 0.0, 1.0)))
+        for shot in (now, before)
+    )
+    found = _warped(image, previous, places_px=jnp.asarray(places), matches=jnp.asarray(matches))
+    return float(found), float(matches.mean())
 
 
 def _progressive(options: "Trace", world: World, camera: Camera, out: Path) -> tuple[list[Path], dict]:
@@ -100,17 +149,6 @@ def _progressive(options: "Trace", world: World, camera: Camera, out: Path) -> t
     return paths, {"spp": spp, "seconds": time.perf_counter() - started, **picture.chosen}
 
 
-def orbit(camera: Camera, angle_radians: float) -> Camera:
-    """The camera, gone round what it looks at, about the vertical, counter-clockwise seen from above."""
-    cos, sin = math.cos(angle_radians), math.sin(angle_radians)
-    x, y, z = np.asarray(camera.eye - camera.target, np.float64)
-    away = np.array([cos * x + sin * z, y, cos * z - sin * x])
-    up = np.asarray(camera.up, np.float64)
-    up = np.array([cos * up[0] + sin * up[2], up[1], cos * up[2] - sin * up[0]])
-    eye = camera.target + jnp.asarray(away, jnp.float32)
-    return dataclasses.replace(camera, eye=eye, up=jnp.asarray(up, jnp.float32))
-
-
 def _told(picture: Rendered, spp: int) -> str:
     chosen = picture.chosen
     if chosen.get("method", "none") == "none":
@@ -135,3 +173,6 @@ def _write(picture: Rendered, out: Path, options: "Trace") -> list[Path]:
     for path, layers in zip(paths, (clean, noisy), strict=True):
         write_exr(path, {**layers, **shared})
     return [out, *paths]
+
+
+_warped = jax.jit(warped_flicker)

@@ -15,7 +15,7 @@ PACKAGES = ("jaxrender", "torchref", "fitting", "benchmarks")
 GROUND = {"scene", "camera", "vecmath", "warp", "brdf", "metrics", "checks", "machine", "srgb", "sh_basis", "vec3"}
 COMMANDS = {
     "__main__", "cli", "console", "denoise_command", "denoise_inputs", "denoise_page", "doctor", "quad_costs",
-    "quads_command", "render_command", "trace_command",
+    "quads_command", "render_command", "trace_command", "trace_frames",
 }  # fmt: skip
 
 #: Part of jaxrender -> the other parts it may import. Data runs from the first line to the last.

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrender.metrics import flip, heatmap, mse, psnr, relative_l2, ssim
+from jaxrender.metrics import flicker, flip, heatmap, mse, psnr, relative_l2, ssim, warped_flicker
 
 
 def test_known_values():
@@ -77,6 +77,35 @@ def test_flip_checks_its_arguments():
 def test_shapes_must_agree(metric):
     with pytest.raises(ValueError, match="expected one shape"):
         metric(jnp.zeros((12, 12, 3)), jnp.zeros((12, 13, 3)))
+
+
+def test_flicker_of_noise_is_its_variance(rng):
+    """Of frames apart, and of each and the one before: with a standard deviation of 3, 9 and 3 √2."""
+    noise = 3.0 * rng.standard_normal((6, 50, 60, 3)).astype(np.float32) + rng.random((50, 60, 3)).astype(np.float32)
+    frames = jnp.asarray(noise)
+    # The variance of a variance over n values is 2 / n of its square, for normal ones.
+    spread = 9.0 * np.sqrt(2.0 / (5 * 50 * 60 * 3))
+    assert abs(float(flicker(frames)) - 9.0) < 5.0 * spread
+    assert float(flicker(jnp.broadcast_to(frames[:1], frames.shape))) < 1e-12
+    y, x = np.meshgrid(np.arange(50) + 0.5, np.arange(60) + 0.5, indexing="ij")
+    still = {"places_px": jnp.asarray(np.stack([x, y], axis=-1), jnp.float32), "matches": jnp.ones((50, 60), bool)}
+    found = float(warped_flicker(frames[1], frames[0], **still))
+    assert abs(found**2 - 18.0) < 5.0 * 18.0 * np.sqrt(2.0 / (50 * 60 * 3))
+    with pytest.raises(ValueError, match="frames: number: expected a value >= 2, got 1"):
+        flicker(frames[:1])
+
+
+def test_a_picture_that_moves_as_a_whole_does_not_flicker():
+    """A plane of colors, moved by a fraction of a pixel; what came into view counts only if it is said to match."""
+    y, x = np.meshgrid(np.arange(8) + 0.5, np.arange(9) + 0.5, indexing="ij")
+    plane = lambda x, y: jnp.asarray(np.stack([0.1 * x, 0.2 * y, 0.05 * (x + y)], axis=-1), jnp.float32)  # noqa: E731
+    moved = np.stack([x - 1.25, y + 0.5], axis=-1)
+    inside = (moved[..., 0] >= 0.5) & (moved[..., 1] <= 7.5)
+    places = jnp.asarray(moved, jnp.float32)
+    image, previous = plane(x - 1.25, y + 0.5), plane(x, y)
+    assert float(warped_flicker(image, previous, places_px=places, matches=jnp.asarray(inside))) < 1e-6
+    assert float(warped_flicker(image, previous, places_px=places, matches=jnp.ones_like(inside))) > 1e-2
+    assert float(warped_flicker(image, previous, places_px=places, matches=jnp.zeros_like(inside))) == 0.0
 
 
 def test_ssim_refuses_tiny_images():

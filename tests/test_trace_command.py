@@ -5,10 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from jaxrender import cli
+from jaxrender import cli, trace_command
 from jaxrender.io import read_exr_layers
 from jaxrender.io.aovs import read_layered_file
 from jaxrender.io.picture import read_png
+from tests.io.test_animated_scene import stage
 
 SMALL = ["--size", "40", "30", "--spp", "1", "--bounces", "1"]
 
@@ -64,13 +65,62 @@ def test_rays_by_the_tree(folder, capsys):
     assert (np.abs(pictures[0] - pictures[1]) < 0.01).all(axis=-1).mean() > 0.98
 
 
+def test_a_clip_is_played_and_its_flicker_told(folder, capsys):
+    """The second frame of the animation is the picture of its time; materials are kept, and the ground is under it."""
+    (folder / "stage.glb").write_bytes(stage().glb())
+    play = ["trace", "stage.glb", "--clip", "turn", "--ground", "--eye", "4", "5", "7", "--json", *SMALL]
+    assert cli.main([*play, "-o", "a.png", "--frames", "2", "--fps", "2"]) == 0
+    out, err = capsys.readouterr()
+    record = json.loads(out)
+    assert record["paths"] == ["a.0001.png", "a.0002.png"] and record["clip"] == "turn" and record["triangles"] == 8
+    assert "stage: clip turn, 1.00 s; 2 frames" in err
+    (flicker,), (share,), seconds = (record[name] for name in ("flicker_rms_255", "seen_in_both", "seconds"))
+    assert 0.0 < flicker < 100.0 and 0.1 < share < 1.0 and len(seconds) == 2
+    assert f"flicker {flicker:.2f} of 255" in err
+    first, second = (read_png(folder / f"a.000{k}.png") for k in (1, 2))
+    assert np.abs(first - second).mean() > 0.002
+
+
+def test_light_turns_and_new_seeds_flicker(folder, capsys):
+    """Shadows wander with the sun; a still scene flickers by its seeds only."""
+    view = ["--eye", "1.5", "1.2", "2.5", "--target", "0", "0.9", "0", "--json", *SMALL]
+    assert cli.main(["trace", "-o", "s.png", "--frames", "2", "--turn-light-degrees", "180", *view]) == 0
+    turned = json.loads(capsys.readouterr().out)
+    assert cli.main(["trace", "-o", "n.png", "--frames", "2", "--new-seeds", *view]) == 0
+    still = json.loads(capsys.readouterr().out)
+    assert turned["flicker_rms_255"][0] > 2.0 * still["flicker_rms_255"][0] > 0.0
+    assert "clip" not in still
+
+
+def test_frames_that_are_finished_stay(folder, capsys, monkeypatch):
+    """Ctrl-C in the second frame: exit status 130, and what there is."""
+    whole = trace_command.render
+
+    def interrupted(*args, **options):
+        if (folder / "k.0001.png").exists():
+            raise KeyboardInterrupt
+        return whole(*args, **options)
+
+    monkeypatch.setattr(trace_command, "render", interrupted)
+    assert cli.main(["trace", "-o", "k.png", "--frames", "3", "--orbit-degrees", "90", *SMALL]) == 130
+    assert "interrupted; 1 of 3 frames are finished and stay" in capsys.readouterr().err
+    assert sorted(path.name for path in folder.glob("k*")) == ["k.0001.png"]
+
+
 @pytest.mark.parametrize(
     ("options", "line"),
     [
         (["--spp", "0"], "--spp: expected a value >= 1, got 0"),
         (["--bounces", "99"], "--bounces: expected at most 64, got 99"),
         (["--time", "0"], "--time: expected a finite number above 0, got 0.0"),
-        (["--frames", "3"], "--orbit-degrees: expected a number that is not 0 with --frames, got 0.0"),
+        (
+            ["--frames", "3"],
+            "--frames: expected --clip, --orbit-degrees, --turn-light-degrees or --new-seeds beside it",
+        ),
+        (["--orbit-degrees", "nan"], "--orbit-degrees: expected a finite number, got nan"),
+        (["--clip", "0", "--fps", "0"], "--fps: expected a finite number above 0, got 0.0"),
+        (["--clip", "0", "--start-seconds", "-1"], "--start-seconds: expected a finite number >= 0, got -1.0"),
+        (["--clip", "fly"], "mannequin: clip: expected one of walk"),
         (["--time", "5", "--frames", "2", "--orbit-degrees", "9"], "--time: expected it without --frames"),
         (["-o", "a.jpg"], "-o: a.jpg: expected a name ending in .png, got .jpg"),
         (["no.gltf"], "no.gltf"),

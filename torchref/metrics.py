@@ -5,7 +5,7 @@ Values are linear or display-encoded, whichever the caller reports; `peak` is th
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchref._precision import in_float64
@@ -47,6 +47,35 @@ def psnr(image: Float[Tensor, "*b"], reference: Float[Tensor, "*b"], *, peak: fl
 def relative_l2(values: Float[Tensor, "*b"], reference: Float[Tensor, "*b"]) -> Float[Tensor, ""]:
     """‖values − reference‖ / ‖reference‖; 0 for an all-zero reference."""
     return safe_div(safe_sqrt(((values - reference) ** 2).sum()), safe_sqrt((reference**2).sum()))
+
+
+@in_float64
+def flicker(frames: Float[Tensor, "f h w c"]) -> Float[Tensor, ""]:
+    """Mean over all values of their variance over the frames, over f - 1."""
+    return frames.var(dim=0, correction=1).mean()
+
+
+@in_float64
+def warped_flicker(
+    image: Float[Tensor, "h w c"],
+    previous: Float[Tensor, "h w c"],
+    *,
+    places_px: Float[Tensor, "h w 2"],
+    matches: Bool[Tensor, "h w"],
+) -> Float[Tensor, ""]:
+    """√ mean (image - previous at places)² over the pixels that match, pixel by pixel; 0 if there are none."""
+    height, width = image.shape[:2]
+    squares = []
+    for row, column in matches.nonzero().tolist():
+        x, y = places_px[row, column] - 0.5
+        left, top = int(torch.floor(x)), int(torch.floor(y))
+        before = 0.0
+        for j in (top, top + 1):
+            for i in (left, left + 1):
+                texel = previous[min(max(j, 0), height - 1), min(max(i, 0), width - 1)]
+                before = before + (1 - (x - i).abs()) * (1 - (y - j).abs()) * texel
+        squares.append((image[row, column] - before) ** 2)
+    return torch.stack(squares).mean().sqrt() if squares else (0.0 * image).sum()
 
 
 def ssim(

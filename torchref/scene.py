@@ -114,10 +114,11 @@ def scene_bounds(scene: Scene) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
 
 
 def whole_scene_camera(
-    scene: Scene, *, aspect: int | float = 1.0, azimuth_radians: float = 0.6, elevation_radians: float = 0.35
-) -> Camera:
-    """`frame_bounds` of the scene's box."""
-    low, high = scene_bounds(scene)
+    scene: Scene, *, aspect: int | float = 1.0, azimuth_radians: float = 0.6, elevation_radians: float = 0.35,
+    bounds: tuple[Float[Tensor, "3"], Float[Tensor, "3"]] | None = None,
+) -> Camera:  # fmt: skip
+    """`frame_bounds` of the scene's box, or of another one."""
+    low, high = bounds or scene_bounds(scene)
     return frame_bounds(low, high, azimuth_radians=azimuth_radians, elevation_radians=elevation_radians, aspect=aspect)
 
 

@@ -100,7 +100,9 @@ def transform_normals(linear: Float[Array, "*#b 3 3"], normals: Float[Array, "*#
     return normalize(jnp.where(dot(m0, cofactors[..., 0]) < 0, -mapped, mapped))
 
 
-def skin_mesh(skin: Skin, globals: Float[Array, "*b j 4 4"]) -> SkinnedMesh:
+def skin_mesh(
+    skin: Skin, globals: Float[Array, "*b j 4 4"], *, tangents: Float[Array, "v 3"] | None = None
+) -> SkinnedMesh:
     """Linear blend skinning: x' = Σ_k w_k G_k B_k x, with a frame at each vertex that moves with the skin.
 
     The tangent is the image of a fixed tangent at rest, so the frame does not spin against the surface
@@ -108,6 +110,7 @@ def skin_mesh(skin: Skin, globals: Float[Array, "*b j 4 4"]) -> SkinnedMesh:
 
     Args:
       globals: world from joint, for every joint of the skeleton (`global_matrices`).
+      tangents: those at rest, such as the directions of growing u; None takes any.
     References:
       glTF 2.0, section 3.7.3; Magnenat-Thalmann et al., "Joint-Dependent Local Deformations for Hand
       Animation and Object Grasping", Graphics Interface 1988.
@@ -115,9 +118,9 @@ def skin_mesh(skin: Skin, globals: Float[Array, "*b j 4 4"]) -> SkinnedMesh:
     matrices = skinning_matrices(skin, globals)
     leading = matrices.shape[:-3]
     linear = matrices[..., :3]
+    tangents = orthonormal_tangent(skin.normals) if tangents is None else tangents
     vertices, normals, tangents = (
-        jnp.broadcast_to(rest, (*leading, *rest.shape))
-        for rest in (skin.vertices, skin.normals, orthonormal_tangent(skin.normals))
+        jnp.broadcast_to(rest, (*leading, *rest.shape)) for rest in (skin.vertices, skin.normals, tangents)
     )
     frames = frame_from_normal_tangent(transform_normals(linear, normals), _apply(linear, tangents))
     return SkinnedMesh(positions=_apply(linear, vertices) + matrices[..., 3], frames=frames)

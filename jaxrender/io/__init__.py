@@ -8,4 +8,5 @@ from jaxrender.io.exr import write_exr as write_exr
 from jaxrender.io.hdr import read_environment as read_environment
 from jaxrender.io.layer_names import known_layers as known_layers
 from jaxrender.io.picture import write_png as write_png
+from jaxrender.io.scene import load_animated_scene as load_animated_scene
 from jaxrender.io.scene import load_scene as load_scene

@@ -4,11 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrender.animation.animated_scene import AnimatedScene
 from jaxrender.animation.mannequin import builtin_character
 from jaxrender.animation.skeleton import global_matrices, sample_clip
 from jaxrender.animation.skinning import skin_mesh
 from jaxrender.io.surfaces import SceneSurface, merged_scene, no_lights, on_device
 from jaxrender.scene import OPAQUE, Material, Scene, SceneImage
+from jaxrender.vecmath import orthonormal_tangent
 
 #: Side of the floor in metres, and of one of its tiles.
 _FLOOR, _TILE = 2.4, 0.3
@@ -39,6 +41,15 @@ def builtin_scene(*, num_vertices: int = 6000) -> Scene:
     return merged_scene(
         [body, floor], material=_materials(), lights=no_lights(), cameras=(), name="mannequin", images=(image,),
         material_names=("clay", "tiles"),
+    )  # fmt: skip
+
+
+def builtin_animated_scene(*, num_vertices: int = 6000) -> AnimatedScene:
+    """The same, with the clips of the mannequin; the floor stays."""
+    character = builtin_character(num_vertices=num_vertices)
+    return AnimatedScene(
+        builtin_scene(num_vertices=num_vertices), character.skeleton, character.skin,
+        orthonormal_tangent(character.skin.normals), clips=character.clips,
     )  # fmt: skip
 
 

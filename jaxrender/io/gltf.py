@@ -10,7 +10,6 @@ Draco or meshopt compression.
 import os
 import pathlib
 from dataclasses import replace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +19,7 @@ from jaxrender.io.gltf_accessors import LARGEST_NUMBER
 from jaxrender.io.gltf_clips import read_clips
 from jaxrender.io.gltf_container import Container, printable
 from jaxrender.io.gltf_meshes import Surface, read_surface
-from jaxrender.io.gltf_nodes import build_skeleton, read_inverse_binds, read_nodes, scene_nodes
+from jaxrender.io.gltf_nodes import Palette, build_skeleton, read_nodes, scene_nodes
 
 
 def read_gltf(path: str | os.PathLike) -> Character:
@@ -37,7 +36,7 @@ def read_gltf(path: str | os.PathLike) -> Character:
     """
     source = Container(pathlib.Path(path))
     graph = read_nodes(source)
-    palette = _Palette(source)
+    palette = Palette(source)
     surfaces = []
     for node in scene_nodes(source, graph):
         surfaces += _read_instance(source, node, palette)
@@ -67,39 +66,7 @@ def read_gltf(path: str | os.PathLike) -> Character:
     )
 
 
-class _Palette:
-    """Palette entries as they are asked for: one block for each skin, one entry for each rigid node."""
-
-    def __init__(self, source: Container):
-        self._source = source
-        self._first_entry: dict[tuple[str, int], int] = {}
-        self._inverse_binds: list[np.ndarray] = []
-        self.nodes: list[int] = []
-
-    def rigid(self, node: int) -> int:
-        """The entry of a node that carries a mesh without a skin."""
-        return self._block(("node", node), [node], np.eye(4)[None])
-
-    def skin(self, index: Any, where: str) -> tuple[int, int]:
-        """The first entry of a skin and the number of its joints."""
-        skin = self._source.item("skins", index, where)
-        if ("skin", index) not in self._first_entry:
-            inverse_binds = read_inverse_binds(self._source, skin, f"skins[{index}]")
-            self._block(("skin", index), skin.joints, inverse_binds)
-        return self._first_entry["skin", index], len(skin.joints)
-
-    def inverse_binds(self) -> np.ndarray:
-        return np.concatenate(self._inverse_binds)
-
-    def _block(self, key: tuple[str, int], nodes: list[int], inverse_binds: np.ndarray) -> int:
-        if key not in self._first_entry:
-            self._first_entry[key] = len(self.nodes)
-            self.nodes.extend(nodes)
-            self._inverse_binds.append(inverse_binds)
-        return self._first_entry[key]
-
-
-def _read_instance(source: Container, node_index: int, palette: _Palette) -> list[Surface]:
+def _read_instance(source: Container, node_index: int, palette: Palette) -> list[Surface]:
     """The surfaces of the mesh on a node, if it has one, with joints counted in the palette."""
     node = source.gltf.nodes[node_index]
     if node.mesh is None:

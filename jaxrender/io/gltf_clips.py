@@ -12,17 +12,18 @@ from jaxrender.io.gltf_nodes import unit_quaternions
 _COMPONENTS = {"translation": 3, "rotation": 4, "scale": 3}
 
 
-def read_clips(source: Container, joint_of: dict[int, int]) -> tuple[Clip, ...]:
+def read_clips(source: Container, joint_of: dict[int, int], *, leave_out_morphs: bool = False) -> tuple[Clip, ...]:
     """All clips, of the channels that move a joint of the skeleton; clips without any are left out.
 
     Args:
       joint_of: from node to joint, for the nodes in the skeleton.
+      leave_out_morphs: of channels of morph weights, which are refused otherwise, leave a note.
     """
     clips: dict[str, Clip] = {}
     for i, animation in enumerate(source.gltf.animations):
-        channels = tuple(_read_channels(source, animation, joint_of, f"animations[{i}]"))
+        channels = tuple(_read_channels(source, animation, joint_of, leave_out_morphs, f"animations[{i}]"))
         if not channels:
-            source.note("clips that move nothing of the character left out")
+            source.note("clips that move nothing left out")
             continue
         start = min(float(channel.times[0]) for channel in channels)
         end = max(float(channel.times[-1]) for channel in channels)
@@ -33,7 +34,9 @@ def read_clips(source: Container, joint_of: dict[int, int]) -> tuple[Clip, ...]:
     return tuple(clips.values())
 
 
-def _read_channels(source: Container, animation: Any, joint_of: dict[int, int], where: str) -> list[Channel]:
+def _read_channels(
+    source: Container, animation: Any, joint_of: dict[int, int], leave_out_morphs: bool, where: str
+) -> list[Channel]:
     channels: list[Channel] = []
     seen: set[tuple[int, str]] = set()
     for i, channel in enumerate(animation.channels):
@@ -45,6 +48,9 @@ def _read_channels(source: Container, animation: Any, joint_of: dict[int, int], 
         source.item("nodes", target.node, f"{field}.target.node")
         joint = joint_of.get(target.node)
         if joint is None:
+            continue
+        if target.path == "weights" and leave_out_morphs:
+            source.note("channels of morph weights left out")
             continue
         if target.path not in _COMPONENTS:
             expected = "translation, rotation or scale (morph weights are not supported)"

@@ -118,6 +118,39 @@ def read_inverse_binds(source: Container, skin: Any, field: str) -> Float64[np.n
     return matrices
 
 
+class Palette:
+    """Palette entries as they are asked for: one block for each skin, one entry for each rigid node."""
+
+    def __init__(self, source: Container):
+        self._source = source
+        self._first_entry: dict[tuple[str, int], int] = {}
+        self._inverse_binds: list[np.ndarray] = []
+        self.nodes: list[int] = []
+
+    def rigid(self, node: int) -> int:
+        """The entry of a node that carries a mesh without a skin."""
+        return self._block(("node", node), [node], np.eye(4)[None])
+
+    def skin(self, index: Any, where: str) -> tuple[int, int]:
+        """The first entry of a skin and the number of its joints."""
+        skin = self._source.item("skins", index, where)
+        if ("skin", index) not in self._first_entry:
+            inverse_binds = read_inverse_binds(self._source, skin, f"skins[{index}]")
+            self._block(("skin", index), skin.joints, inverse_binds)
+        return self._first_entry["skin", index], len(skin.joints)
+
+    def inverse_binds(self) -> Float64[np.ndarray, "p 4 4"]:
+        """The inverse bind matrix of each entry; the identity for a rigid node."""
+        return np.concatenate(self._inverse_binds)
+
+    def _block(self, key: tuple[str, int], nodes: list[int], inverse_binds: np.ndarray) -> int:
+        if key not in self._first_entry:
+            self._first_entry[key] = len(self.nodes)
+            self.nodes.extend(nodes)
+            self._inverse_binds.append(inverse_binds)
+        return self._first_entry[key]
+
+
 def unit_quaternions(source: Container, q: np.ndarray, where: str) -> np.ndarray:
     """The rows normalised; says so if that was more than rounding. Zero is no rotation and refused."""
     length = np.linalg.norm(q.astype(np.float64), axis=-1, keepdims=True)

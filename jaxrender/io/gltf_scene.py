@@ -1,8 +1,8 @@
 """glTF 2.0 and GLB -> `Scene`: every mesh of the default scene in world space, materials, lights and cameras.
 
-The scene stands still: skinned meshes are shown in the pose of their nodes, morph targets and clips are not
-applied. Supported of a mesh: everything `read_gltf` supports, with or without indices, normals, tangents, two or
-more sets of texture coordinates, KHR_texture_transform and vertex colors; KHR_lights_punctual.
+The scene stands still: skinned meshes are shown in the pose of their nodes (`gltf_animated` plays the clips), morph
+targets are not applied. Supported of a mesh: everything `read_gltf` supports, with or without indices, normals,
+tangents, two or more sets of texture coordinates, KHR_texture_transform and vertex colors; KHR_lights_punctual.
 """
 
 import math
@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
+from jaxrender.animation.animated_scene import camera_at
 from jaxrender.camera import Camera
 from jaxrender.io.gltf_accessors import LARGEST_NUMBER, one_a_vertex, read_floats
 from jaxrender.io.gltf_container import Container, printable
@@ -23,13 +25,44 @@ from jaxrender.io.gltf_meshes import (
     read_triangles,
     unit_normals,
 )
-from jaxrender.io.gltf_nodes import read_inverse_binds, read_nodes, scene_nodes
+from jaxrender.io.gltf_nodes import NodeGraph, Palette, read_nodes, scene_nodes
 from jaxrender.io.gltf_scene_materials import Coordinates, MaterialTable, read_materials
 from jaxrender.io.gltf_textures import MissingTexture, transformed
 from jaxrender.io.surfaces import SceneSurface, merged_scene, no_lights, on_device
 from jaxrender.scene import DIRECTIONAL, POINT, SPOT, Lights, Scene
 
 _LIGHTS = "KHR_lights_punctual"
+
+
+@dataclass(frozen=True)
+class GltfPart:
+    """A primitive on a node, in the space of its mesh.
+
+    `joints` are the entries of the palette that carry each vertex, and `weights` their shares; one row for all vertices
+    of a rigid mesh.
+    """
+
+    surface: SceneSurface
+    joints: Int[np.ndarray, "_ k"]
+    weights: Float[np.ndarray, "_ k"]
+    where: str
+
+
+@dataclass(frozen=True)
+class GltfScene:
+    """The scene of a file before it takes a pose.
+
+    `light_nodes` and `camera_nodes` are those of the default scene with a light, and with a perspective camera, in the
+    order of `Scene.lights` and `Scene.cameras`.
+    """
+
+    source: Container
+    graph: NodeGraph
+    palette: Palette
+    table: MaterialTable
+    parts: list[GltfPart]
+    light_nodes: list[int]
+    camera_nodes: list[int]
 
 
 def read_gltf_scene(path: str | os.PathLike) -> Scene:
@@ -41,6 +74,11 @@ def read_gltf_scene(path: str | os.PathLike) -> Scene:
     Raises:
       InputError: naming the file, the field, what was expected and what came.
     """
+    return rest_scene(open_gltf_scene(path))
+
+
+def open_gltf_scene(path: str | os.PathLike) -> GltfScene:
+    """Everything that `read_gltf_scene` needs of a file but the pose."""
     source = Container(pathlib.Path(path))
     graph = read_nodes(source)
     nodes = scene_nodes(source, graph)
@@ -51,19 +89,29 @@ def read_gltf_scene(path: str | os.PathLike) -> Scene:
         for primitive, where in _primitives(source, node)
     ]
     table = read_materials(source, with_default=any(primitive.material is None for _, primitive, _ in instances))
-    world = graph.world_matrices()
-    read = [_read_surface(source, *instance, world, table) for instance in instances]
-    surfaces = [surface for surface in read if surface is not None]
-    if not surfaces:
+    palette = Palette(source)
+    read = [_read_part(source, *instance, palette, table) for instance in instances]
+    parts = [part for part in read if part is not None]
+    if not parts:
         left_out = "; ".join(source.notes) or "no mesh in the scene"
         source.bad("meshes", expected="at least one triangle", got=left_out)
+    return GltfScene(
+        source, graph, palette, table, parts, _light_nodes(source, nodes), _camera_nodes(source, nodes)
+    )  # fmt: skip
+
+
+def rest_scene(opened: GltfScene) -> Scene:
+    """The scene in the pose of its nodes, in world space."""
+    source, table, world = opened.source, opened.table, opened.graph.world_matrices()
+    with np.errstate(all="ignore"):
+        palette = world[opened.palette.nodes] @ opened.palette.inverse_binds()
     return merged_scene(
-        surfaces,
+        [_moved(source, part.surface, _blended(source, part, palette), part.where) for part in opened.parts],
         material=table.material,
         material_names=table.names,
         images=table.images,
-        lights=_read_lights(source, nodes, world),
-        cameras=_read_cameras(source, nodes, world),
+        lights=_read_lights(source, opened.light_nodes, world),
+        cameras=_read_cameras(source, opened.camera_nodes, world),
         name=printable(source.path.stem),
         notes=source.notes,
     )
@@ -75,10 +123,10 @@ def _primitives(source: Container, node: int) -> list[tuple[Any, str]]:
     return [(p, f"meshes[{index}].primitives[{i}]") for i, p in enumerate(mesh.primitives)]
 
 
-def _read_surface(
-    source: Container, node: int, primitive: Any, where: str, world: np.ndarray, table: MaterialTable
-) -> SceneSurface | None:
-    """One primitive in world space, or None if it has no triangles."""
+def _read_part(
+    source: Container, node: int, primitive: Any, where: str, palette: Palette, table: MaterialTable
+) -> GltfPart | None:
+    """One primitive, or None if it has no triangles."""
     triangles = read_triangles(source, primitive, where)
     if triangles is None:
         return None
@@ -97,17 +145,18 @@ def _read_surface(
     uv = _read_uv(source, attributes, table.coordinates[material_id], v, where)
     colors = _read_colors(source, attributes, v, where)
     tangents = _read_tangents(source, attributes, v, where)
-    matrices = _matrices(source, node, attributes, world, v, where)
+    joints, weights = _read_carriers(source, node, attributes, palette, v, where)
     if "NORMAL" not in attributes:
         # glTF asks for flat shading: every corner is a vertex of its own.
         corners = faces.ravel()
         positions, normals, uv, colors = (x[corners] for x in (positions, normals, uv, colors))
         tangents = None
-        matrices = matrices if len(matrices) == 1 else matrices[corners]
+        if len(joints) > 1:
+            joints, weights = joints[corners], weights[corners]
         faces = np.arange(len(corners)).reshape(-1, 3)
     normals = unit_normals(source, positions, normals, faces)
     surface = SceneSurface(positions, normals, tangents, uv, colors, faces, np.full(len(faces), material_id))
-    return _moved(source, surface, matrices, where)
+    return GltfPart(surface, joints, weights, where)
 
 
 def _read_uv(source: Container, attributes: dict, wanted: Coordinates, num_vertices: int, where: str) -> np.ndarray:
@@ -144,23 +193,26 @@ def _read_tangents(source: Container, attributes: dict, num_vertices: int, where
     return one_a_vertex(source, tangents, num_vertices, f"{where}.TANGENT")
 
 
-def _matrices(
-    source: Container, node: int, attributes: dict, world: np.ndarray, num_vertices: int, where: str
-) -> np.ndarray:
-    """World from mesh: one matrix, or with a skin one for each vertex, blended at the pose of the nodes."""
-    skin_index = source.gltf.nodes[node].skin
-    if skin_index is None:
-        return world[node][None]
-    skin = source.item("skins", skin_index, f"nodes[{node}].skin")
-    inverse_binds = read_inverse_binds(source, skin, f"skins[{skin_index}]")
+def _read_carriers(
+    source: Container, node: int, attributes: dict, palette: Palette, num_vertices: int, where: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """`GltfPart.joints` and `weights`."""
+    skin = source.gltf.nodes[node].skin
+    if skin is None:
+        return np.full((1, 1), palette.rigid(node)), np.ones((1, 1), np.float32)
+    first, num_joints = palette.skin(skin, f"nodes[{node}].skin")
     joints, weights = read_influences(source, attributes, num_vertices, where)
-    joints, weights = checked_influences(source, joints, weights, np.arange(num_vertices), len(skin.joints), where)
-    source.spend(16 * num_vertices, where)
+    joints, weights = checked_influences(source, joints, weights, np.arange(num_vertices), num_joints, where)
+    return joints + first, weights
+
+
+def _blended(source: Container, part: GltfPart, palette: np.ndarray) -> np.ndarray:
+    """World from mesh: one matrix, or with a skin one for each vertex."""
+    source.spend(16 * len(part.joints), part.where)
+    blended = np.zeros((len(part.joints), 4, 4))
     with np.errstate(all="ignore"):
-        palette = world[skin.joints] @ inverse_binds
-        blended = np.zeros((num_vertices, 4, 4))
-        for k in range(weights.shape[1]):
-            blended += weights[:, k, None, None] * palette[joints[:, k]]
+        for k in range(part.weights.shape[1]):
+            blended += part.weights[:, k, None, None] * palette[part.joints[:, k]]
     return blended
 
 
@@ -194,38 +246,45 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _read_cameras(source: Container, nodes: list[int], world: np.ndarray) -> tuple[Camera, ...]:
-    """The perspective cameras on the nodes of the scene; scale and the file's own clipping planes do not count."""
-    cameras = []
+def _light_nodes(source: Container, nodes: list[int]) -> list[int]:
+    return [node for node in nodes if source.gltf.nodes[node].extensions.get(_LIGHTS) is not None]
+
+
+def _camera_nodes(source: Container, nodes: list[int]) -> list[int]:
+    """Those with a perspective camera; says that there are others."""
+    found = []
     for node in nodes:
         index = source.gltf.nodes[node].camera
         if index is None:
             continue
-        record, field = source.item("cameras", index, f"nodes[{node}].camera"), f"cameras[{index}]"
-        if record.perspective is None:
+        if source.item("cameras", index, f"nodes[{node}].camera").perspective is None:
             source.note("orthographic cameras left out")
-            continue
+        else:
+            found.append(node)
+    return found
+
+
+def _read_cameras(source: Container, nodes: list[int], world: np.ndarray) -> tuple[Camera, ...]:
+    """The perspective cameras on nodes; scale and the file's own clipping planes do not count."""
+    cameras = []
+    for node in nodes:
+        field = f"cameras[{source.gltf.nodes[node].camera}]"
+        record = source.item("cameras", source.gltf.nodes[node].camera, f"nodes[{node}].camera")
         fov = _number(source, record.perspective.yfov, None, f"{field}.perspective.yfov")
         if not 0.0 < fov < math.pi:
             source.bad(f"{field}.perspective.yfov", expected="an angle between 0 and π", got=fov)
         eye, _, up, backward = _placed(source, world[node], f"nodes[{node}]")
-        # The target is a unit away, or as far as the origin: nearer, float32 would turn the view.
-        reach = max(1.0, float(np.abs(eye).max()))
-        target = eye - reach * backward
-        cameras.append(Camera(on_device(eye), on_device(target), on_device(up), on_device(np.array(fov))))
+        cameras.append(camera_at(eye, up, backward, fov))
     return tuple(cameras)
 
 
 def _read_lights(source: Container, nodes: list[int], world: np.ndarray) -> Lights:
-    """The lights of KHR_lights_punctual on the nodes of the scene."""
+    """The lights of KHR_lights_punctual on nodes."""
     declared = _dictionary(source.gltf.extensions.get(_LIGHTS)).get("lights", [])
     rows = []
     for node in nodes:
-        reference = source.gltf.nodes[node].extensions.get(_LIGHTS)
-        if reference is None:
-            continue
         where = f"nodes[{node}].{_LIGHTS}.light"
-        index = _dictionary(reference).get("light")
+        index = _dictionary(source.gltf.nodes[node].extensions.get(_LIGHTS)).get("light")
         if not isinstance(declared, list) or type(index) is not int or not 0 <= index < len(declared):
             source.bad(where, expected="the index of a light", got=index)
         source.spend(16, where)

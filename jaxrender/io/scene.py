@@ -2,7 +2,9 @@
 
 import pathlib
 
+from jaxrender.animation.animated_scene import AnimatedScene
 from jaxrender.checks import bad_input
+from jaxrender.io.gltf_animated import read_gltf_animated
 from jaxrender.io.gltf_scene import read_gltf_scene
 from jaxrender.io.mesh_files import read_mesh_scene
 from jaxrender.io.scene_json import read_json_scene
@@ -35,3 +37,20 @@ def load_scene(path: str | pathlib.Path) -> Scene:
     return bad_input(
         path, "file", expected="a scene (glTF, GLB, PLY, OBJ or scene.json)", got=f"ending {ending or 'none'}"
     )
+
+
+def load_animated_scene(path: str | pathlib.Path) -> AnimatedScene:
+    """Reads a scene with the clips that move it: skinned characters, rigid parts, lights and cameras.
+
+    Args:
+      path: glTF 2.0 (.gltf, .glb).
+    Raises:
+      InputError: if the file is no glTF, or as in `load_scene`.
+      OSError: if it cannot be read.
+    """
+    path = pathlib.Path(path)
+    with open(path, "rb") as file:
+        start = file.read(4)
+    if start == b"glTF" or path.suffix.lower() in (".gltf", ".glb"):
+        return read_gltf_animated(path)
+    return bad_input(path, "file", expected="a scene with clips (glTF or GLB)", got=f"ending {path.suffix or 'none'}")

@@ -69,12 +69,15 @@ def sky_image(ambient: Float[Array, "3 k"], *, height: int = 32) -> Float[np.nda
     return np.maximum(basis @ np.asarray(ambient, np.float64).T, 0.0).astype(np.float32)
 
 
-def move(world: World, scene: Scene) -> World:
+def move(
+    world: World, scene: Scene, *, lights: Lights | None = None, environment: Float[np.ndarray, "h w 3"] | None = None
+) -> World:
     """The world of the same scene in another pose: with the same faces, materials and images.
 
-    Textures, lights without extent and surroundings stay, and so does who traces the rays; `extent` too, so that guides
-    mean the same in all frames.
+    Textures stay, and so does who traces the rays; `extent` too, so that guides mean the same in all frames.
 
+    Args:
+      lights, environment: instead of those so far, which stay if none are given.
     Raises:
       ValueError: if the number of triangles differs, or positions are not finite.
     """
@@ -83,9 +86,11 @@ def move(world: World, scene: Scene) -> World:
         raise ValueError(f"scene.faces: expected {count}, as before, got {len(scene.faces)}")
     _check_finite(scene)
     table = surface_table(scene, textures=world.table.textures)
-    emitters = make_emitters(scene, table, lights=world.emitters.lights)
-    groups = tuple(group for group in ALL_GROUPS if group in (*emitters.groups, *world.emitters.groups))
-    emitters = dataclasses.replace(emitters, environment=world.emitters.environment, groups=groups)
+    lights = world.emitters.lights if lights is None else lights
+    emitters = make_emitters(scene, table, lights=lights, environment=environment)
+    if environment is None and world.emitters.environment is not None:
+        groups = tuple(group for group in ALL_GROUPS if group in (*emitters.groups, "environment"))
+        emitters = dataclasses.replace(emitters, environment=world.emitters.environment, groups=groups)
     return World(table, emitters, world.rays.moved(scene, table), world.extent, world.notes)
 
 

@@ -669,7 +669,7 @@ def test_clip_names_are_distinct_and_idle_clips_left_out(tmp_path):
     b.json["animations"][3]["channels"][0]["target"]["node"] = 2  # the node of a skinned mesh moves nothing
     character = load(b, tmp_path)
     assert [clip.name for clip in character.clips] == ["turn", "turn_1", "clip_2"]
-    assert character.notes == ("clips that move nothing of the character left out: 1",)
+    assert character.notes == ("clips that move nothing left out: 1",)
 
 
 def test_no_animation_is_fine(tmp_path):

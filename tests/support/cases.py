@@ -728,7 +728,7 @@ def _pose_model() -> list[Case]:
     ]
 
 
-def _skinning() -> list[Case]:
+def _skin_and_globals() -> tuple[Record, np.ndarray]:
     v, k, p, j = 6, 3, 4, 5
     weights = _uniform(0, 1, v, k)
     weights[0] = [1, 0, 0]
@@ -745,6 +745,11 @@ def _skinning() -> list[Case]:
             "inverse_binds": inverse_binds,
         },
     )
+    return skin, matrices
+
+
+def _skinning() -> list[Case]:
+    skin, matrices = _skin_and_globals()
     linear = _normal(7, 3, 3)
     linear[0] = np.diag([2.0, 1.0, -1.0])
     linear[1] = np.diag([1.0, 1.0, 0.0])
@@ -1859,6 +1864,31 @@ def _sharpness() -> list[Case]:
     ]
 
 
+def _motion() -> list[Case]:
+    """What animations add."""
+    skin, matrices = _skin_and_globals()
+    image, previous = _uniform(0, 1, 2, 6, 7, 3)
+    pair = {"image": image, "previous": previous}
+    places = np.stack([_uniform(0.5, 6.5, 6, 7), _uniform(0.5, 5.5, 6, 7)], axis=-1)
+    places[0, :2] = [[0.5, 0.5], [6.5, 5.5]]
+    some = _uniform(0, 1, 6, 7) < 0.7
+    some[0, :2] = True
+    return [
+        Case(
+            "animation.skinning.skin_mesh",
+            {"skin": skin, "globals": matrices, "tangents": _unit(6)},
+            "own tangents",
+            gradients=("globals", "tangents"),
+        ),
+        Case("metrics.flicker", {"frames": _uniform(0, 1, 5, 6, 7, 3)}, gradients=("frames",)),
+        Case(
+            "metrics.warped_flicker", {**pair, "places_px": places, "matches": some},
+            gradients=tuple(pair), ulps32=LONG_SUM,
+        ),
+        Case("metrics.warped_flicker", {**pair, "places_px": places, "matches": np.zeros_like(some)}, "none"),
+    ]  # fmt: skip
+
+
 CASES: tuple[Case, ...] = tuple(
     case
     for room in (
@@ -1866,7 +1896,7 @@ CASES: tuple[Case, ...] = tuple(
         _pose_model, _skeleton, _skinning, _camera, _metrics, _scene, _texture, _quads, _warps, _brdf,
         _whole_scene, _deferred_shading, _late, _box_filters, _guided_filter, _pair_filters, _denoising, _rays,
         _three_vectors, _sequences, _surroundings, _lookups, _scattering, _hit_points, _emitters, _paths,
-        _sharpness,
+        _sharpness, _motion,
     )
     for case in room()
 )  # fmt: skip

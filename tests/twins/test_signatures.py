@@ -53,10 +53,12 @@ UNPAIRED_MODULES = {
     "pathtrace.programs": "runs on the host: which kernels make a program, and rays in between",
     "pathtrace.guide_rays": "runs on the host: the order of the kernels",
     "pathtrace.render": "the same",
+    "pathtrace.reprojection": "runs on the host: rays, and which pixels show the same surface",
 }
 
 # Public names without a partner, or with another signature.
 EXCEPTIONS = {
+    "scene.with_ground": "puts a record together on the host; judged in tests/io/test_animated_scene.py",
     "metrics.flip": "a library's; judged in tests/test_metrics.py",
     "vecmath.constant_like": "writes out broadcasts, which torch does by itself",
     "harmonics.sh.order_of": "a detail of how jaxrender reads an array's shape",

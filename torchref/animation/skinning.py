@@ -81,7 +81,9 @@ def transform_normals(linear: Float[Tensor, "*#b 3 3"], normals: Float[Tensor, "
 
 
 @in_float64
-def skin_mesh(skin: Skin, globals: Float[Tensor, "*b j 4 4"]) -> SkinnedMesh:
+def skin_mesh(
+    skin: Skin, globals: Float[Tensor, "*b j 4 4"], *, tangents: Float[Tensor, "v 3"] | None = None
+) -> SkinnedMesh:
     """x' = Σ_k w_k G_k B_k x, and at each vertex a frame from the skinned normal and a skinned rest tangent.
 
     References:
@@ -91,5 +93,6 @@ def skin_mesh(skin: Skin, globals: Float[Tensor, "*b j 4 4"]) -> SkinnedMesh:
     linear, offset = matrices[..., :3], matrices[..., 3]
     positions = torch.einsum("...ij,...j->...i", linear, skin.vertices) + offset
     normals = transform_normals(linear, skin.normals)
-    tangents = torch.einsum("...ij,...j->...i", linear, orthonormal_tangent(skin.normals))
+    at_rest = orthonormal_tangent(skin.normals) if tangents is None else tangents
+    tangents = torch.einsum("...ij,...j->...i", linear, at_rest)
     return SkinnedMesh(positions, frame_from_normal_tangent(normals, tangents))
