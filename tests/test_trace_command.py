@@ -78,7 +78,8 @@ def test_a_clip_is_played_and_its_flicker_told(folder, capsys):
     assert 0.0 < flicker < 100.0 and 0.1 < share < 1.0 and len(seconds) == 2
     assert f"flicker {flicker:.2f} of 255" in err
     first, second = (read_png(folder / f"a.000{k}.png") for k in (1, 2))
-    assert np.abs(first - second).mean() > 0.002
+    # Seeds are the same: what differs has moved.
+    assert np.abs(first - second).mean() > 2e-4
 
 
 def test_light_turns_and_new_seeds_flicker(folder, capsys):

@@ -28,7 +28,7 @@ END = {
 def stage() -> GltfBuilder:
     """A skinned tetrahedron, a mirrored square with a normal map on a moving node, and there a lamp; a moving camera.
 
-    Nodes 0 to 2 as in `tetrahedron`; 3 the square, 4 the lamp below it, 5 the camera. One clip of a second, from 0.5 on.
+    Nodes 0 to 2 as in `tetrahedron`; 3 the square, 4 the lamp below it, 5 camera and sun. One clip, from 0.5 to 1.5 s.
     """
     b = tetrahedron()
     stream = io.BytesIO()

@@ -326,6 +326,16 @@ def test_a_scene_without_light_gets_a_sun_and_says_so():
     assert not prepare(room(floor()), environment=WHITE).notes
 
 
+def test_a_lamp_without_extent_is_light_enough():
+    """No light is soft: there are no ratios to look up, and direct light is that of the guide rays."""
+    lamp = light(POINT, position=(0.0, 2.0, 0.0), intensity=(9.0, 9.0, 9.0))
+    world = prepare(room(floor(), lights=lamp))
+    found = render(world, ABOVE, settings=TraceSettings(samples_per_pixel=2, bounces=1), **SIZE)
+    assert world.emitters.groups == ("lights",) and found.guides.arrived.shape == (*found.image.shape[:2], 0)
+    # Straight under the lamp: I / d² · albedo / π.
+    np.testing.assert_allclose(found.direct.max(axis=(0, 1)), 9.0 / 4.0 * np.array([0.6, 0.5, 0.4]) / np.pi, rtol=0.05)
+
+
 def test_a_world_that_moves_is_the_one_built_anew():
     """Lamp and ball move; textures and surroundings are kept."""
 
