@@ -12,6 +12,12 @@ from typing import TypeVar
 
 import jax
 
+# Limit and use of memory of a control group, version 2 and 1, as a container sees them.
+_GROUP_FILES = (
+    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+)
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -21,6 +27,28 @@ def num_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def available_memory() -> int | None:
+    """Bytes that can still be had, within the limit of this process's control group; None where nobody tells."""
+    found = []
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in pathlib.Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                found.append(1024 * int(line.split()[1]))
+    for limit, used in _GROUP_FILES:
+        # "max" where there is no limit.
+        with contextlib.suppress(OSError, ValueError):
+            most = int(pathlib.Path(limit).read_text())
+            found.append(max(most - int(pathlib.Path(used).read_text()), 0))
+    return min(found, default=None)
+
+
+def check_memory(what: str, needed: int) -> None:
+    """Raises MemoryError, with how much is there, unless so many bytes can be had for `what`."""
+    free = available_memory()
+    if free is not None and needed > free:
+        raise MemoryError(f"for {what}: about {needed / 1e9:.1f} GB needed, {free / 1e9:.1f} GB available")
 
 
 def keep_xla_to_one_thread() -> None:

@@ -1,6 +1,7 @@
 """What goes into the methods: meshes, meshes that move, and scenes with materials, lights and cameras."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -184,11 +185,11 @@ def with_ground(
       width: of the plane, over the diagonal of that box.
       color: its reflectance.
     """
-    low, high = (np.asarray(corner, np.float64) for corner in (low, high))
-    half = 0.5 * width * (float(np.linalg.norm(high - low)) or 1.0)
-    x, z = 0.5 * (low + high)[[0, 2]]
+    box = np.asarray([low, high], np.float64)
+    half = 0.5 * width * (float(np.linalg.norm(box[1] - box[0])) or 1.0)
+    x, height, z = 0.5 * (box[0, 0] + box[1, 0]), box[0, 1], 0.5 * (box[0, 2] + box[1, 2])
     signs = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
-    corners = np.stack([x + half * signs[:, 0], np.full(4, low[1]), z + half * signs[:, 1]], axis=1)
+    corners = np.stack([x + half * signs[:, 0], np.full(4, height), z + half * signs[:, 1]], axis=1)
     row = lambda *numbers: np.tile(np.array(numbers, np.float32), (4, 1))  # noqa: E731
     added = {
         "positions": corners.astype(np.float32), "normals": row(0, 1, 0), "tangents": row(1, 0, 0, 1),
@@ -196,7 +197,7 @@ def with_ground(
         "faces": len(scene.positions) + np.array([[0, 1, 2], [0, 2, 3]], np.int32),
         "material_id": np.full(2, len(scene.material.metallic), np.int32),
     }  # fmt: skip
-    below = {name: jnp.concatenate([getattr(scene, name), rows]) for name, rows in added.items()}
+    below: dict[str, Any] = {name: jnp.concatenate([getattr(scene, name), rows]) for name, rows in added.items()}
     material = jax.tree.map(lambda own, new: jnp.concatenate([own, new[None]]), scene.material, _matt(color))
     return replace(scene, **below, material=material, material_names=(*scene.material_names, "ground"))
 

@@ -23,7 +23,7 @@ from jaxrender.pathtrace.guide_rays import pooled, trace_guides
 from jaxrender.pathtrace.render import Rendered, combine, filter_incident, render
 from jaxrender.pathtrace.reprojection import previous_places
 from jaxrender.pathtrace.settings import TraceSettings
-from jaxrender.pathtrace.world import World
+from jaxrender.pathtrace.world import NO_LIGHTS, World
 from jaxrender.scene import Scene
 from jaxrender.srgb import encode_srgb
 from jaxrender.trace_frames import Film, open_film
@@ -44,7 +44,8 @@ def run_trace(options: "Trace") -> None:
     started = time.perf_counter()
     world = film.first_world()
     for note in world.notes:
-        console.announce(f"{film.scene.name}: {note}")
+        other = " (--environment takes a map instead)" if note == NO_LIGHTS else ""
+        console.announce(f"{film.scene.name}: {note}{other}")
     console.announce(f"{len(film.scene.faces)} triangles ready after {time.perf_counter() - started:.1f} s")
     if options.time is not None:
         paths, record = _progressive(options, world, film.view(0, film.scene), out)

@@ -65,7 +65,11 @@ class Film:
         if self.clip is None and angle == 0.0:
             return first
         lights = scene.lights if len(scene.lights.kind) else first.emitters.lights
-        turned = None if self.environment is None or angle == 0.0 else rotate_environment(self.environment, angle)
+        turned = (
+            None
+            if self.environment is None or angle == 0.0
+            else rotate_environment(jnp.asarray(self.environment), angle)
+        )
         return move(
             first, scene, lights=turned_lights(lights, angle),
             environment=None if turned is None else np.asarray(turned),

@@ -10,7 +10,8 @@ import jaxrender
 
 #: Folders and files of pure kernels. Their rules are the strictest.
 KERNELS = (
-    "jaxrender.vecmath", "jaxrender.vec3", "jaxrender.warp", "jaxrender.brdf", "jaxrender.camera", "jaxrender.metrics",
+    "jaxrender.vecmath", "jaxrender.vec3", "jaxrender.warp", "jaxrender.brdf", "jaxrender.camera", "jaxrender.latlong",
+    "jaxrender.metrics",
     "jaxrender.animation", "jaxrender.filters", "jaxrender.deferred", "jaxrender.pathtrace",
     "jaxrender.harmonics",
 )  # fmt: skip

@@ -12,7 +12,9 @@ import pytest
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PACKAGES = ("jaxrender", "torchref", "fitting", "benchmarks")
 
-GROUND = {"scene", "camera", "vecmath", "warp", "brdf", "metrics", "checks", "machine", "srgb", "sh_basis", "vec3"}
+GROUND = {
+    "scene", "camera", "vecmath", "warp", "brdf", "metrics", "checks", "machine", "srgb", "sh_basis", "vec3", "latlong",
+}  # fmt: skip
 COMMANDS = {
     "__main__", "cli", "console", "denoise_command", "denoise_inputs", "denoise_page", "doctor", "quad_costs",
     "quads_command", "render_command", "trace_command", "trace_frames",

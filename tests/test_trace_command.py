@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxrender import cli, trace_command
-from jaxrender.io import read_exr_layers
+from jaxrender.io import read_exr_layers, write_exr
 from jaxrender.io.aovs import read_layered_file
 from jaxrender.io.picture import read_png
 from tests.io.test_animated_scene import stage
@@ -26,7 +26,8 @@ def test_picture_parts_and_noisy_layers(folder, capsys):
     out, err = capsys.readouterr()
     record = json.loads(out)
     assert record["paths"] == ["a.png", "a.exr", "a.noisy.exr"] and record["method"] == "guided" and record["spp"] == 1
-    assert "rays: Embree" in err and "mannequin: no lights, a sun and a sky were added" in err
+    assert "mannequin: no lights, a sun and a sky were added (--environment takes a map instead)" in err
+    assert "rays: Embree" in err
     picture = read_png(folder / "a.png")
     assert picture.shape == (30, 40, 3) and 0.05 < picture.mean() < 0.95
     clean = read_exr_layers(folder / "a.exr")
@@ -106,6 +107,20 @@ def test_frames_that_are_finished_stay(folder, capsys, monkeypatch):
     assert cli.main(["trace", "-o", "k.png", "--frames", "3", "--orbit-degrees", "90", *SMALL]) == 130
     assert "interrupted; 1 of 3 frames are finished and stay" in capsys.readouterr().err
     assert sorted(path.name for path in folder.glob("k*")) == ["k.0001.png"]
+
+
+def test_what_is_too_large_or_not_light_is_one_line(folder, capsys, monkeypatch):
+    """More triangles than memory, and a map with NaN: exit status 2; a scene without light is offered a map."""
+    image = np.ones((4, 8, 3), np.float32)
+    image[0, 0, 0], image[1, 1, 1] = np.nan, -1.0
+    write_exr(folder / "sky.exr", {"": image})
+    assert cli.main(["trace", "--environment", "sky.exr", *SMALL]) == 2
+    got = "expected finite values of at least 0, got 1 NaN or Inf and 1 negative ones"
+    assert f"sky.exr: radiance: {got}" in capsys.readouterr().err
+    monkeypatch.setattr("jaxrender.machine.available_memory", lambda: 10**6)
+    assert cli.main(["trace", *SMALL]) == 2
+    (line,) = [text for text in capsys.readouterr().err.splitlines() if text.startswith("jaxrender: error")]
+    assert "not enough memory for 11794 triangles: about" in line and line.endswith("GB available")
 
 
 @pytest.mark.parametrize(

@@ -19,10 +19,11 @@ from fitting.motion import TRAIN
 from fitting.solve import ORDER, PoseRows
 from fitting.training_data import TrainingData, project
 from jaxrender.harmonics.brdf_operator import phong_operator
-from jaxrender.harmonics.light import environment_directions, project_environment, sh_area_light
+from jaxrender.harmonics.light import project_environment, sh_area_light
 from jaxrender.harmonics.sh import sh_basis, sh_rotate
 from jaxrender.harmonics.visibility import hemisphere_directions
 from jaxrender.harmonics.zh import hemisphere_zh, zh_to_sh
+from jaxrender.latlong import environment_directions
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ from jaxrender.camera import Camera, camera_rays, clip_from_world, depth_range
 from jaxrender.deferred.interpolate import interpolate
 from jaxrender.deferred.raster import Fragments, rasterize
 from jaxrender.deferred.samples import ordered_grid
+from jaxrender.latlong import to_angles
+from jaxrender.vec3 import from_array
 from jaxrender.vecmath import matmul
 
 
@@ -94,10 +96,9 @@ def environment_background(
       environment: row 0 is +Y, the middle looks down -Z, columns turn towards +X.
     """
     _, directions = camera_rays(camera, height=height, width=width)
-    x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+    theta, phi = (np.asarray(angle, np.float64) for angle in to_angles(from_array(directions)))
     eh, ew = environment.shape[:2]
-    row = np.arccos(np.clip(y, -1.0, 1.0)) / np.pi * eh - 0.5
-    column = (np.arctan2(x, -z) / (2 * np.pi) + 0.5) * ew - 0.5
+    row, column = theta / np.pi * eh - 0.5, (phi / (2 * np.pi) + 0.5) * ew - 0.5
     where = np.stack([np.clip(row, 0, eh - 1), column])
     channels = [map_coordinates(c, where, order=1, mode="grid-wrap") for c in np.moveaxis(environment, -1, 0)]
     return np.stack(channels, axis=-1).astype(np.float32)

@@ -4,7 +4,6 @@ from jaxrender.harmonics.brdf_operator import apply_operator as apply_operator
 from jaxrender.harmonics.brdf_operator import brdf_operator as brdf_operator
 from jaxrender.harmonics.brdf_operator import phong_normalization as phong_normalization
 from jaxrender.harmonics.brdf_operator import phong_operator as phong_operator
-from jaxrender.harmonics.light import environment_directions as environment_directions
 from jaxrender.harmonics.light import project_environment as project_environment
 from jaxrender.harmonics.light import rotate_environment as rotate_environment
 from jaxrender.harmonics.light import sh_area_light as sh_area_light
@@ -53,3 +52,4 @@ from jaxrender.harmonics.zh_fit import fit_shared_axes as fit_shared_axes
 from jaxrender.harmonics.zh_fit import fit_zh_lobes as fit_zh_lobes
 from jaxrender.harmonics.zh_fit import optimal_linear_direction as optimal_linear_direction
 from jaxrender.harmonics.zh_fit import solve_lobe_coefficients as solve_lobe_coefficients
+from jaxrender.latlong import environment_directions as environment_directions

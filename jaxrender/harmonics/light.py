@@ -1,7 +1,7 @@
 """Light as SH coefficients per colour channel: environment maps and lamps.
 
-A light has shape (c, order**2), world axes (right-handed, +Y up), radiance per channel. All but the tables of
-`environment_directions` is differentiable in its arrays.
+A light has shape (c, order**2), world axes (right-handed, +Y up), radiance per channel. All is differentiable in its
+arrays.
 """
 
 import math
@@ -13,26 +13,8 @@ from jaxtyping import Array, Float
 from jaxrender.checks import check_at_least, check_order
 from jaxrender.harmonics.sh import bands, basis_columns, order_of, sh_basis
 from jaxrender.harmonics.zh import zh_to_sh
+from jaxrender.latlong import azimuths, environment_directions, solid_angles
 from jaxrender.vecmath import constant_like, einsum
-
-
-def environment_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (h, w, 3) of the pixel centres of a latitude-longitude image and their solid angles (h, w).
-
-    Row 0 is the zenith (+Y); the middle of the image looks down -Z and columns turn towards +X. The solid
-    angles are exact (cosine differences), 4π in all.
-    """
-    theta = (np.arange(height) + 0.5) * (math.pi / height)
-    phi = _azimuths(width)
-    edges = np.cos(np.arange(height + 1) * (math.pi / height))
-    solid = np.repeat((edges[:-1] - edges[1:])[:, None] * (2 * math.pi / width), width, axis=1)
-    s, c = np.sin(theta)[:, None], np.cos(theta)[:, None]
-    parts = np.broadcast_arrays(s * np.sin(phi), c, -s * np.cos(phi))
-    return np.stack(parts, axis=-1), solid
-
-
-def _azimuths(width: int) -> np.ndarray:
-    return (np.arange(width) + 0.5) * (2 * math.pi / width) - math.pi
 
 
 def _waves(phi: np.ndarray, order: int) -> np.ndarray:
@@ -51,7 +33,7 @@ def _row_table(height: int, order: int) -> np.ndarray:
     directions, _ = environment_directions(height, count)
     basis = np.stack(basis_columns(*np.moveaxis(directions, -1, 0), order=order), axis=-1)
     norm = np.where(np.arange(count) == 0, 1.0, 2.0) / count
-    return np.einsum("hjk,jt->htk", basis, _waves(_azimuths(count), order) * norm)
+    return np.einsum("hjk,jt->htk", basis, _waves(azimuths(count), order) * norm)
 
 
 def project_environment(image: Float[Array, "h w c"], *, order: int) -> Float[Array, "c k"]:
@@ -70,9 +52,8 @@ def project_environment(image: Float[Array, "h w c"], *, order: int) -> Float[Ar
     if image.ndim != 3:
         raise ValueError(f"image: expected shape (h, w, c), got {tuple(image.shape)}")
     height, width = image.shape[:2]
-    _, solid = environment_directions(height, 1)
-    waves = _waves(_azimuths(width), order)
-    table = _row_table(height, order) * (solid / width)[:, :, None]
+    waves = _waves(azimuths(width), order)
+    table = _row_table(height, order) * solid_angles(height, width)[:, None, None]
     rows = einsum("hwc,wt->htc", image, jnp.asarray(waves, dtype=image.dtype))
     return einsum("htc,htk->ck", rows, jnp.asarray(table, dtype=image.dtype))
 

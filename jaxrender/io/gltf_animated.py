@@ -60,7 +60,8 @@ def read_gltf_animated(path: str | os.PathLike) -> AnimatedScene:
 def _side_by_side(parts: list[GltfPart]) -> tuple[np.ndarray, np.ndarray]:
     """Joints and weights of all vertices, as many a vertex as any needs."""
     width = max(part.weights.shape[1] for part in parts)
-    joints, weights = [], []
+    joints: list[np.ndarray] = []
+    weights: list[np.ndarray] = []
     for part in parts:
         shape = len(part.surface.positions), part.weights.shape[1]
         for rows, values in ((joints, part.joints), (weights, part.weights)):

@@ -22,6 +22,9 @@ from jaxrender.vec3 import Scalar, Vec3, dot
 #: Kinds of lights, in the order in which they are drawn.
 ALL_GROUPS = ("area", "lights", "environment")
 
+#: In the square of the scene's unit.
+_SMALLEST_AREA = 1e-30
+
 #: Barycentric coordinates at which the emission of a triangle is read for the tables.
 _PROBES = ((1 / 3, 1 / 3), (0.1, 0.1), (0.8, 0.1), (0.1, 0.8))
 
@@ -101,7 +104,9 @@ def _shining(scene: Scene, table: SurfaceTable) -> tuple[np.ndarray, np.ndarray,
     emissive = np.asarray(scene.material.emissive)
     p = np.asarray(scene.positions, np.float64)[faces]
     area = 0.5 * np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
-    triangle = np.flatnonzero((emissive[material] > 0.0).any(axis=1) & (area > 0.0)).astype(np.int32)
+    # Below this, 1 / area leaves the range of float32; no ray would find such a triangle either.
+    glows = (emissive[material] > 0.0).any(axis=1) & (area > _SMALLEST_AREA)
+    triangle = np.flatnonzero(glows).astype(np.int32)
     power = area[triangle] * _mean_emission(table, triangle)
     triangle, power = triangle[power > 0.0], power[power > 0.0]
     a, b, c = (p[triangle, k] for k in range(3))
@@ -128,7 +133,7 @@ def draw_area(emitters: Emitters, table: SurfaceTable, position: Vec3, pick: Sca
     n = vec3.normalize(vec3.cross(e1, e2))
     toward = -dot(n, wi)
     shown = jnp.where(emitters.two_sided[triangle], jnp.abs(toward), jnp.maximum(toward, 0.0))
-    density = emitters.area_density[triangle] * distance2 / jnp.maximum(shown, 1e-6)
+    density = area_density(emitters, triangle, distance, shown)
     if "emissive_texture" in table.slots:
         radiance = hit_surface(table, triangle, jnp.stack([b1, b2], axis=-1), wi).emissive
     return Arriving(wi, distance, vec3.where(shown > 1e-6, radiance / density, 0.0), density)

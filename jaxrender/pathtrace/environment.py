@@ -1,7 +1,6 @@
 """Light from infinitely far away: a latitude-longitude image, drawn from by brightness.
 
-Row 0 of the image is the zenith (+Y); its middle looks down -Z and columns turn towards +X, as in
-`harmonics.environment_directions`. The radiance of a texel is the same all over it, so that densities are exact.
+Rows and columns are those of `latlong`. The radiance of a texel is the same all over it, so that densities are exact.
 """
 
 import math
@@ -14,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxrender.checks import bad_input
+from jaxrender.latlong import solid_angles, to_angles, to_direction
 from jaxrender.vec3 import Scalar, Vec3
 
 
@@ -50,11 +50,12 @@ def make_environment(image: Float[np.ndarray, "h w 3"]) -> Environment:
     image = np.asarray(image, np.float32)
     if image.ndim != 3 or image.shape[-1] != 3 or 0 in image.shape:
         bad_input("environment", "shape", expected="(h, w, 3)", got=image.shape)
-    if not np.isfinite(image).all() or (image < 0.0).any():
-        bad_input("environment", "radiance", expected="finite numbers >= 0", got="others")
+    lost, negative = ~np.isfinite(image), image < 0.0
+    if lost.any() or negative.any():
+        got = f"{lost.sum()} NaN or Inf and {(negative & ~lost).sum()} negative ones"
+        bad_input("environment", "radiance", expected="finite numbers >= 0", got=got)
     height, width = image.shape[:2]
-    edges = np.cos(np.arange(height + 1) * (math.pi / height))
-    solid = ((edges[:-1] - edges[1:]) * (2.0 * math.pi / width))[:, None]
+    solid = solid_angles(height, width)[:, None]
     power = image.astype(np.float64).mean(axis=-1) * solid
     black = power.sum() == 0.0
     power = np.broadcast_to(solid, power.shape) if black else power
@@ -70,8 +71,7 @@ def make_environment(image: Float[np.ndarray, "h w 3"]) -> Environment:
 def texel_of(environment: Environment, direction: Vec3) -> tuple[Int[Array, "*b"], Int[Array, "*b"]]:
     """Row and column of a unit direction."""
     height, width = environment.density.shape
-    theta = jnp.arccos(jnp.clip(direction.y, -1.0, 1.0))
-    phi = jnp.arctan2(direction.x, -direction.z)
+    theta, phi = to_angles(direction)
     row = jnp.clip((theta * (height / math.pi)).astype(jnp.int32), 0, height - 1)
     column = jnp.clip(((phi + math.pi) * (width / (2.0 * math.pi))).astype(jnp.int32), 0, width - 1)
     return row, column
@@ -95,8 +95,7 @@ def draw_direction(environment: Environment, u: Scalar, v: Scalar) -> FarLight:
     top, bottom = (jnp.cos((row + i).astype(u.dtype) * (math.pi / height)) for i in (0, 1))
     y = top + (bottom - top) * du
     phi = (column.astype(v.dtype) + dv) * (2.0 * math.pi / width) - math.pi
-    radius = jnp.sqrt(jnp.maximum(1.0 - y * y, 0.0))
-    return _at(environment, Vec3(radius * jnp.sin(phi), y, -radius * jnp.cos(phi)), row, column)
+    return _at(environment, to_direction(y, phi), row, column)
 
 
 def _at(environment: Environment, direction: Vec3, row: Int[Array, "*b"], column: Int[Array, "*b"]) -> FarLight:

@@ -19,7 +19,7 @@ from jaxrender.deferred.preview import (
     render_vertex_colors,
     visible_surface,
 )
-from jaxrender.harmonics.light import environment_directions
+from jaxrender.latlong import environment_directions
 
 EPS = np.finfo(np.float32).eps
 

@@ -31,9 +31,9 @@ from jaxrender.animation.skinning import Character, Skin
 from jaxrender.camera import project_px
 from jaxrender.checks import InputError
 from jaxrender.harmonics import hemisphere_zh, project_environment, rotate_environment, sh_basis
-from jaxrender.harmonics.light import environment_directions
 from jaxrender.harmonics.pose_model import FeatureBasis, PoseModel
 from jaxrender.io.picture import read_png
+from jaxrender.latlong import environment_directions
 from tests.support.asserts import assert_close
 from tests.support.tolerances import LONG_SUM
 

@@ -284,7 +284,6 @@ def _brdf_operator() -> list[Case]:
 
 def _light() -> list[Case]:
     return [
-        Case("harmonics.light.environment_directions", {"height": 6, "width": 8}, host=True),
         Case(
             "harmonics.light.project_environment",
             {"image": _uniform(0, 3, 8, 16, 3), "order": 5},
@@ -1865,7 +1864,7 @@ def _sharpness() -> list[Case]:
 
 
 def _motion() -> list[Case]:
-    """What animations add."""
+    """What animations add, and directions of images."""
     skin, matrices = _skin_and_globals()
     image, previous = _uniform(0, 1, 2, 6, 7, 3)
     pair = {"image": image, "previous": previous}
@@ -1879,6 +1878,14 @@ def _motion() -> list[Case]:
             {"skin": skin, "globals": matrices, "tangents": _unit(6)},
             "own tangents",
             gradients=("globals", "tangents"),
+        ),
+        Case("latlong.environment_directions", {"height": 6, "width": 8}, host=True),
+        Case("latlong.azimuths", {"width": 9}, host=True),
+        Case("latlong.solid_angles", {"height": 7, "width": 3}, host=True),
+        Case("latlong.to_angles", {"direction": _vec(_unit(30))}, gradients=("direction",), on={"direction": "sphere"}),
+        Case(
+            "latlong.to_direction", {"cosine": _uniform(-0.99, 0.99, 30), "azimuth": _uniform(-3.1, 3.1, 30)},
+            gradients=("cosine", "azimuth"), ulps32=LONG_SUM,
         ),
         Case("metrics.flicker", {"frames": _uniform(0, 1, 5, 6, 7, 3)}, gradients=("frames",)),
         Case(

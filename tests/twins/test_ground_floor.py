@@ -5,6 +5,6 @@ import pytest
 from tests.twins.agreement import cases_of, check
 
 
-@pytest.mark.parametrize(("case", "dtype"), cases_of("vecmath.", "camera.", "metrics.", "scene."))
+@pytest.mark.parametrize(("case", "dtype"), cases_of("vecmath.", "camera.", "latlong.", "metrics.", "scene."))
 def test_twin(case, dtype):
     check(case, dtype)

@@ -17,7 +17,8 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 # What of jaxrender has a partner in torchref: whole rooms, and single modules. The rest of `animation` builds
 # the data of the built-in body.
 PAIRED = (
-    "vecmath", "camera", "metrics", "scene", "brdf", "harmonics.", "animation.skeleton", "animation.skinning",
+    "vecmath", "camera", "latlong", "metrics", "scene", "brdf", "harmonics.",
+    "animation.skeleton", "animation.skinning",
     "deferred.samples", "deferred.texture", "deferred.quads", "deferred.warps", "deferred.gbuffer", "deferred.shade",
     "deferred.late", "deferred.metrics", "deferred.sampling", "deferred.clusters", "deferred.fxaa", "deferred.mlaa",
     "deferred.sraa", "deferred.highlights", "filters.", "vec3", "pathtrace.",

@@ -13,7 +13,7 @@ from torch import Tensor
 from tests.support import oracles
 from tests.support.asserts import assert_close
 from tests.support.tolerances import TIGHT
-from torchref import camera, metrics, vecmath
+from torchref import camera, latlong, metrics, vecmath
 from torchref.animation import skeleton, skinning
 from torchref.harmonics import (
     brdf_operator,
@@ -316,7 +316,7 @@ def test_unshadowed_visibility_becomes_the_clamped_cosine():
 def test_environment_is_read_with_its_orientation(rng):
     """A map of f(direction) has the SH of f; which way is up, ahead and right is part of f."""
     c = rng.normal(size=9)
-    directions, solid_angle = light.environment_directions(64, 128)
+    directions, solid_angle = latlong.environment_directions(64, 128)
     assert solid_angle.sum() == pytest.approx(4 * math.pi, rel=1e-14)
     image = sh.sh_evaluate(tensor(c), directions)[..., None].expand(-1, -1, 3)
     # Exact solid angles at row centres: the error is that of the midpoint rule, (π/64)² / 24 per unit

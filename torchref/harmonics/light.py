@@ -13,21 +13,7 @@ from torchref import _quadrature
 from torchref._precision import in_float64
 from torchref.harmonics.sh import sh_basis
 from torchref.harmonics.zh import zh_to_sh, zonal_integral
-
-
-def environment_directions(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Directions (h, w, 3) of the pixel centres of a latitude-longitude image, and solid angles (h, w).
-
-    Row 0 is the zenith (+Y), the middle looks down -Z, columns turn towards +X.
-    """
-    rows, columns = torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64)
-    theta = math.pi * (rows + 0.5) / height
-    phi = 2.0 * math.pi * ((columns + 0.5) / width - 0.5)
-    sin, cos = torch.sin(theta)[:, None], torch.cos(theta)[:, None]
-    directions = torch.stack([sin * torch.sin(phi), cos * torch.ones_like(phi), -sin * torch.cos(phi)], dim=-1)
-    edges = torch.cos(math.pi * torch.arange(height + 1, dtype=torch.float64) / height)
-    solid_angle = (edges[:-1] - edges[1:]) * 2.0 * math.pi / width
-    return directions, solid_angle[:, None].expand(height, width)
+from torchref.latlong import environment_directions
 
 
 @in_float64

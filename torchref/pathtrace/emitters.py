@@ -57,7 +57,7 @@ def draw_area(emitters: Emitters, table: SurfaceTable, position: Vec3, pick: Sca
     cosine = dot(normalize(torch.linalg.cross(edge_1, edge_2)), -wi)
     both = emitters.two_sided[triangle.long()][:, None]
     seen = torch.where(both, cosine.abs(), cosine.clamp(min=0.0))
-    density = emitters.area_density[triangle.long()][:, None] * distance**2 / seen.clamp(min=1e-6)
+    density = area_density(emitters, triangle, distance[:, 0], seen[:, 0])[:, None]
     if "emissive_texture" in table.slots:
         places = torch.cat([b, c], dim=1)
         radiance = to_array(hit_surface(table, triangle, places, from_array(wi)).emissive)

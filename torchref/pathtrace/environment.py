@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchref._precision import in_float64
+from torchref.latlong import solid_angles, to_angles, to_direction
 from torchref.vec3 import Scalar, Vec3, from_array
 
 
@@ -36,8 +37,7 @@ def make_environment(image: Float[np.ndarray, "h w 3"]) -> Environment:
     """The chance of a texel is its share of Σ mean radiance · solid angle; of a black image, that of the sphere."""
     image = torch.as_tensor(image)
     height, width = image.shape[:2]
-    edges = torch.cos(torch.arange(height + 1, dtype=torch.float64) * math.pi / height)
-    solid = (-edges.diff() * 2.0 * math.pi / width)[:, None].expand(height, width)
+    solid = solid_angles(height, width)[:, None].expand(height, width)
     weight = image.mean(dim=-1) * solid
     if not weight.any():
         weight = solid
@@ -51,9 +51,7 @@ def make_environment(image: Float[np.ndarray, "h w 3"]) -> Environment:
 def texel_of(environment: Environment, direction: Vec3) -> tuple[Int[Tensor, "*b"], Int[Tensor, "*b"]]:
     """The texel in whose ranges of polar angle and azimuth a direction lies."""
     height, width = environment.density.shape
-    x, y, z = (c.double() for c in direction)
-    # The polar angle from both of its legs keeps its digits at the poles.
-    polar, azimuth = torch.atan2(torch.hypot(x, z), y), torch.atan2(x, -z)
+    polar, azimuth = to_angles(Vec3(*(c.double() for c in direction)))
     row = torch.floor(polar / math.pi * height).clamp(0, height - 1)
     column = torch.floor((azimuth / (2.0 * math.pi) + 0.5) * width).clamp(0, width - 1)
     return row.int(), column.int()
@@ -74,10 +72,8 @@ def draw_direction(environment: Environment, u: Scalar, v: Scalar) -> FarLight:
         row, down = _inverted(environment.rows, a)
         column, across = _inverted(environment.columns[row], b)
         top, bottom = (math.cos((row + i) * math.pi / height) for i in (0, 1))
-        polar = torch.acos((1.0 - down) * top + down * bottom)
         azimuth = ((column + across) / width - 0.5) * 2.0 * math.pi
-        sine = torch.sin(polar)
-        places.append(torch.stack([sine * torch.sin(azimuth), torch.cos(polar), -sine * torch.cos(azimuth)]))
+        places.append(torch.stack(to_direction((1.0 - down) * top + down * bottom, azimuth)))
         rows.append(row)
         columns.append(column)
     direction = from_array(torch.stack(places).reshape(*u.shape, 3))
