@@ -4,6 +4,7 @@ Host programs, NumPy in and out.
 """
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -64,14 +65,14 @@ def previous_places(
 def _centres(world: World, camera: Camera, *, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Triangle and barycentrics at the centres of all pixels, row by row."""
     view = programs.make_view(camera, height=height)
-    starts, size = programs.blocks(height * width)
-    found = []
-    for start in starts:
-        rays, _ = programs.eye_rays(view, start, 0, 0, block=size, height=height, width=width)
-        hits = world.rays.closest(programs.rows(rays.origin), programs.rows(rays.direction))
-        found.append((np.asarray(hits.triangle), np.asarray(hits.barycentrics)))
-    triangle, barycentrics = (np.concatenate(x)[: height * width] for x in zip(*found, strict=True))
-    return triangle, barycentrics
+
+    def trace(start: int, *, block: int) -> programs.Images:
+        rays, _ = programs.eye_rays(view, start, 0, 0, block=block, height=height, width=width)
+        hits = world.rays.closest(rays, jnp.ones(block, bool))
+        return {"triangle": (jnp.asarray(hits.triangle),), "barycentrics": list(jnp.asarray(hits.barycentrics).T)}
+
+    found = programs.trace_blocks(trace, height=height, width=width)
+    return found["triangle"].reshape(-1), found["barycentrics"].reshape(-1, 2)
 
 
 _project = jax.jit(project_px, static_argnames=("height", "width"))
