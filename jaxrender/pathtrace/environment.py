@@ -1,6 +1,6 @@
 """Light from infinitely far away: a latitude-longitude image, drawn from by brightness.
 
-Rows and columns are those of `latlong`. The radiance of a texel is the same all over it, so that densities are exact.
+Rows and columns are those of `latlong`. As a light, a texel has one radiance all over, so that densities are exact.
 """
 
 import math
@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxrender.checks import bad_input
 from jaxrender.latlong import solid_angles, to_angles, to_direction
-from jaxrender.vec3 import Scalar, Vec3
+from jaxrender.vec3 import Scalar, Vec3, from_array
 
 
 @jax.tree_util.register_dataclass
@@ -82,6 +82,27 @@ def look_up(environment: Environment, direction: Vec3) -> FarLight:
     return _at(environment, direction, *texel_of(environment, direction))
 
 
+def background(environment: Environment, direction: Vec3) -> Vec3:
+    """The radiance that an eye sees in a unit direction: bilinear between the middles of texels, closed around.
+
+    Light is drawn and met texel by texel; only what is seen directly is smooth.
+    """
+    height, width = environment.density.shape
+    theta, phi = to_angles(direction)
+    down = jnp.clip(theta * (height / math.pi) - 0.5, 0.0, height - 1.0)
+    across = (phi + math.pi) * (width / (2.0 * math.pi)) - 0.5
+    row, column = jnp.floor(down), jnp.floor(across)
+    shares = down - row, across - column
+    row, column = row.astype(jnp.int32), column.astype(jnp.int32)
+    total = Vec3(*(jnp.zeros_like(theta),) * 3)
+    for below in (0, 1):
+        for right in (0, 1):
+            texel = environment.radiance[jnp.minimum(row + below, height - 1), (column + right) % width]
+            share = (shares[0] if below else 1.0 - shares[0]) * (shares[1] if right else 1.0 - shares[1])
+            total = total + from_array(texel) * share
+    return total
+
+
 def draw_direction(environment: Environment, u: Scalar, v: Scalar) -> FarLight:
     """A direction by brightness, from two uniform numbers in [0, 1)."""
     height, width = environment.density.shape
@@ -100,8 +121,7 @@ def draw_direction(environment: Environment, u: Scalar, v: Scalar) -> FarLight:
 
 def _at(environment: Environment, direction: Vec3, row: Int[Array, "*b"], column: Int[Array, "*b"]) -> FarLight:
     texel = environment.radiance[row, column]
-    radiance = Vec3(texel[..., 0], texel[..., 1], texel[..., 2])
-    return FarLight(direction, radiance, environment.density[row, column])
+    return FarLight(direction, from_array(texel), environment.density[row, column])
 
 
 def _found(table, u: Scalar, size: int) -> Int[Array, "*b"]:

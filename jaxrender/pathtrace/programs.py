@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxrender import vec3
 from jaxrender.camera import Camera, look_at, project_px
@@ -20,6 +20,7 @@ from jaxrender.machine import num_cores
 from jaxrender.pathtrace import paths
 from jaxrender.pathtrace.backends import on_the_device
 from jaxrender.pathtrace.emitters import Emitters
+from jaxrender.pathtrace.environment import Environment, background
 from jaxrender.pathtrace.guide_lookup import guide_lookup
 from jaxrender.pathtrace.hit_points import (
     HitPoints,
@@ -108,6 +109,8 @@ def see(
     path = paths.begin(len(rays.direction.x))
     hits, surface = hit(world, rays, path.alive, view.step)
     emission = meet(world.emitters, path, rays.direction, hits.t, surface, left=Vertex(-1, 0, 1, model))
+    if world.emitters.environment is not None:
+        emission = _before_the_sky(world.emitters.environment, rays.direction, surface.triangle, emission)
     at, path = arrive(path, rays.direction, surface, model=model)
     path, images = _look(view, at, path, by_ratio=by_ratio)
     return at, path, images | {"emission": emission}
@@ -246,6 +249,12 @@ def _look(view: View, at: Reflector, path: Path, *, by_ratio: bool) -> tuple[Pat
     channels: dict[str, Sequence[Scalar]] = {**images, "depth": (depth,), "sharpness": (sharpness(at),)}
     masked = {name: [jnp.where(seen, c, 0.0) for c in image] for name, image in channels.items()}
     return path._replace(shared=smooth | (not by_ratio)), masked
+
+
+@jax.jit
+def _before_the_sky(environment: Environment, direction: Vec3, triangle: Int[Array, " n"], emission: Vec3) -> Vec3:
+    """The emission of what is seen, and a smooth background."""
+    return vec3.where(triangle < 0, background(environment, direction), emission)
 
 
 @jax.jit

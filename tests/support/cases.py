@@ -1863,6 +1863,11 @@ def _sharpness() -> list[Case]:
     ]
 
 
+def _backgrounds() -> list[Case]:
+    inputs = {"environment": _environment_record(), "direction": _vec(_unit(40))}
+    return [Case("pathtrace.environment.background", inputs)]
+
+
 def _motion() -> list[Case]:
     """What animations add, and directions of images."""
     skin, matrices = _skin_and_globals()
@@ -1903,7 +1908,7 @@ CASES: tuple[Case, ...] = tuple(
         _pose_model, _skeleton, _skinning, _camera, _metrics, _scene, _texture, _quads, _warps, _brdf,
         _whole_scene, _deferred_shading, _late, _box_filters, _guided_filter, _pair_filters, _denoising, _rays,
         _three_vectors, _sequences, _surroundings, _lookups, _scattering, _hit_points, _emitters, _paths,
-        _sharpness, _motion,
+        _sharpness, _motion, _backgrounds,
     )
     for case in room()
 )  # fmt: skip
