@@ -246,7 +246,7 @@ def screen_triangles(
     clip, faces = jnp.asarray(clip, jnp.float32), jnp.asarray(faces, jnp.int32)
     room = room_for(int(_count_clipped(clip, faces, height=grid.height, width=grid.width)))
     masks = {"drawn": drawn, "two_sided": two_sided}
-    return _set_up(clip, faces, grid, masks, cull=cull, max_clipped=room)
+    return _set_up(clip, faces, masks, height=grid.height, width=grid.width, cull=cull, max_clipped=room)
 
 
 def rasterize_triangles(
@@ -316,10 +316,10 @@ def _count_clipped(clip, faces, *, height, width):
     return jnp.sum(sort_out(clip, faces, height=height, width=width)[1])
 
 
-@functools.partial(jax.jit, static_argnames=("grid", "cull", "max_clipped"))
-def _set_up(clip, faces, grid, masks, *, cull, max_clipped):
-    clipped, _ = clip_triangles(clip, faces, height=grid.height, width=grid.width, max_clipped=max_clipped)
-    return project_triangles(clipped, height=grid.height, width=grid.width, cull=cull, **masks)
+@functools.partial(jax.jit, static_argnames=("height", "width", "cull", "max_clipped"))
+def _set_up(clip, faces, masks, *, height, width, cull, max_clipped):
+    clipped, _ = clip_triangles(clip, faces, height=height, width=width, max_clipped=max_clipped)
+    return project_triangles(clipped, height=height, width=width, cull=cull, **masks)
 
 
 @functools.partial(jax.jit, static_argnames=("grid", "pattern"))
