@@ -34,6 +34,8 @@ def rows(folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(suite, "QUICK", TINY)
+        # At these sizes all views have room in one process, and share their programs.
+        patch.setattr(suite.jax, "clear_caches", lambda: None)
         return list(suite.run(Options(quick=True, seed=3)))
 
 
