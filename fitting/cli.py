@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
+from fitting.checkpoint import NOTHING_KEPT, Checkpoint
 from fitting.config import BakeSettings, FitSettings, SplitSettings, TrainSettings
+from fitting.lock import only_writer
 from fitting.model import (
     MODEL_FILE,
     character_source,
@@ -21,13 +23,14 @@ from fitting.model import (
     save_pose_model,
     source_file,
 )
+from fitting.stages import TIMES_FILE, read_times, write_times
 from jaxrender import cli as jaxrender_cli
 from jaxrender import console
 from jaxrender.animation.mannequin import builtin_character
 from jaxrender.animation.skinning import Character
 from jaxrender.checks import InputError, bad_input
 from jaxrender.harmonics.pose_model import PoseModel
-from jaxrender.io.atomic import write_bytes
+from jaxrender.io.atomic import remove_leftovers, write_bytes
 from jaxrender.io.character import load_character
 from jaxrender.machine import is_writable_folder
 from jaxrender.pathtrace.backends import chosen_backend, told_backend
@@ -35,6 +38,8 @@ from jaxrender.pathtrace.backends import chosen_backend, told_backend
 if TYPE_CHECKING:
     from fitting.evaluate import Evaluation
     from fitting.train import TrainResult
+
+NUMBERS_FILE = "evaluation.json"
 
 Out = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
 
@@ -46,7 +51,7 @@ class Train:
     input: tyro.conf.Positional[Path | None] = None
     """A glTF, GLB or BVH file. Without one, the built-in character."""
     out: Out = Path("out/train")
-    """Folder for the model, the report, the pictures and the bake; a second run continues the bake in it."""
+    """Folder for the model, the report, the pictures and the bake. After an interruption the same command continues."""
     num_vertices: int = 5000
     """Vertices of the mannequin that is grown around a skeleton without a body."""
     bake: BakeSettings = field(default_factory=BakeSettings)
@@ -54,6 +59,8 @@ class Train:
     fit: FitSettings = field(default_factory=FitSettings)
     study: bool = True
     """Compare with the paper's methods and the baselines on a sample of points: a minute or two."""
+    restart: bool = False
+    """Begin anew: throw away the bake and the unfinished work of an earlier run in the folder."""
     json: bool = False
     """Print one JSON object instead of the list of files."""
 
@@ -63,7 +70,7 @@ class Train:
         character = open_character(self.input, self.num_vertices)
         train_and_report(
             character, settings, self.out, source=self.input, num_vertices=self.num_vertices, study=self.study,
-            as_json=self.json,
+            restart=self.restart, as_json=self.json,
         )  # fmt: skip
 
 
@@ -73,6 +80,8 @@ class Evaluate:
 
     model: tyro.conf.Positional[Path]
     """The folder of a training run."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None
+    """Folder for numbers, pictures and report. By default that of the model, unless a training holds it."""
     study: bool = True
     """Compare with the paper's methods and the baselines on a sample of points."""
     json: bool = False
@@ -82,8 +91,9 @@ class Evaluate:
         console.enable_compilation_cache()
         model, header, file, character = open_model(self.model)
         evaluate_and_report(
-            character, model, header, settings_from_header(header, file), file, study=self.study, as_json=self.json
-        )
+            character, model, header, settings_from_header(header, file), file, self.out or file.parent,
+            study=self.study, as_json=self.json,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -156,53 +166,66 @@ def open_model(path: Path) -> tuple[PoseModel, dict, Path, Character]:
 
 def train_and_report(
     character: Character, settings: TrainSettings, out: Path, *, source: Path | None, num_vertices: int, study: bool,
-    as_json: bool,
+    restart: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """The main job: bake, fit, evaluate, pictures, report. Everything heavy is imported here, after the cache is on."""
+    """The main job: bake, fit, evaluate, pictures, report. Everything heavy is imported here, after the cache is on.
+
+    Interrupted at any point, it continues when it is called again, and ends with the same model, bit by bit.
+    """
     _check_writable(out)
-    from fitting.train import train_character
+    from fitting.pictures import PICTURES
+    from fitting.report import REPORT_FILE
+    from fitting.train import character_run, train_character
 
     console.announce_device(rays=told_backend(chosen_backend(settings.bake.rays)))
+    again = "the same command without --restart continues" if restart else "the same command continues"
     with (
         _named_by_file(character, source, out),
-        console.keeping(f"the frames baked so far are in {out}; the same command continues"),
+        console.keeping(f"what was finished is kept in {out}; {again}"),
+        only_writer(out),
     ):
-        result = train_character(character, settings, out, track=_track)
+        for name in (MODEL_FILE, NUMBERS_FILE, TIMES_FILE, REPORT_FILE, *PICTURES):
+            remove_leftovers(out / name)
+        parts = character_run(character, settings, out, restart=restart)
+        result = train_character(character, settings, out, track=_track, checkpoint=parts)
         if not as_json:
             console.announce(
                 f"ridge {result.ridge:g}; {result.bake.rays_per_second / 1e6:.1f} M rays/s; "
                 f"{int((~np.asarray(result.model.visible)).sum())} of {len(result.model.visible)} points see nothing"
             )
-        evaluation = _evaluate(character, result, settings, study=study)
+        evaluation = _evaluate(character, result, settings, study=study, checkpoint=parts)
         found = character_source(character, source, num_vertices)
         header = model_header(result, settings, source=found, errors=evaluation.summary())
         model_path = out / MODEL_FILE
+        # A report that is there is of the model that is there, and the last thing a run writes.
+        (out / REPORT_FILE).unlink(missing_ok=True)
         save_pose_model(model_path, result.model, header)
-        paths = _report(character, result, settings, evaluation, model_path)
+        paths = _report(character, result, settings, evaluation, model_path, out)
+        parts.finish()
     record = {"errors": header["errors"], "ridge": result.ridge, "seconds": result.timings.seconds}
     console.finish(paths=[model_path, *paths], record=record, as_json=as_json)
 
 
 def evaluate_and_report(
-    character: Character, model: PoseModel, header: dict, settings: TrainSettings, file: Path, *, study: bool,
-    as_json: bool,
+    character: Character, model: PoseModel, header: dict, settings: TrainSettings, file: Path, out: Path,
+    *, study: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Measures the model in `file`, which stays as it is, on its own bake; what is missing of that is baked again."""
-    _check_writable(file.parent)
+    _check_writable(out)
     from fitting.dataset import BakeStatistics
-    from fitting.stages import Timings
-    from fitting.train import TrainResult
+    from fitting.train import STORE, TrainResult
     from fitting.training_data import bake_character
 
     console.announce_device(rays=told_backend(chosen_backend(settings.bake.rays)))
-    data, _, motion = bake_character(character, settings, file.parent / "bake.zarr", track=_track)
-    if len(model.axes) != len(data.visible):
-        bad_input(file, "axes", expected=f"{len(data.visible)} points, as its settings make", got=len(model.axes))
-    seconds = dict(header["seconds"])
-    traced = BakeStatistics(header["rays"], float(seconds.get("bake", 0.0)), 0)
-    result = TrainResult(model, data, float(header["ridge"]), traced, Timings(seconds), motion)
-    evaluation = _evaluate(character, result, settings, study=study)
-    paths = _report(character, result, settings, evaluation, file)
+    with only_writer(out):
+        data, _, motion = bake_character(character, settings, file.parent / STORE, track=_track)
+        if len(model.axes) != len(data.visible):
+            bad_input(file, "axes", expected=f"{len(data.visible)} points, as its settings make", got=len(model.axes))
+        times = read_times(file.parent)
+        traced = BakeStatistics(header["rays"], times.rays, times.seconds.get("bake", 0.0), 0)
+        result = TrainResult(model, data, float(header["ridge"]), traced, times, motion)
+        evaluation = _evaluate(character, result, settings, study=study)
+        paths = _report(character, result, settings, evaluation, file, out)
     console.finish(paths=paths, record={"errors": evaluation.summary()}, as_json=as_json)
 
 
@@ -225,11 +248,14 @@ def _check_writable(out: Path) -> None:
         bad_input("-o", str(out), expected="a folder that can be written", got="one that cannot")
 
 
-def _track(items, count, label):
-    return console.track(items, label, total=count)
+def _track(items, count, label, done):
+    return console.track(items, label, total=count, done=done)
 
 
-def _evaluate(character: Character, result: "TrainResult", settings: TrainSettings, *, study: bool) -> "Evaluation":
+def _evaluate(
+    character: Character, result: "TrainResult", settings: TrainSettings, *, study: bool,
+    checkpoint: Checkpoint = NOTHING_KEPT,
+) -> "Evaluation":  # fmt: skip
     from fitting.evaluate import evaluate
     from fitting.features import joint_angle_features
 
@@ -239,26 +265,27 @@ def _evaluate(character: Character, result: "TrainResult", settings: TrainSettin
         return evaluate(
             result.data, result.model, settings.fit, ridge=result.ridge, study=study, track=_track,
             angles=joint_angle_features(character, result.motion) if study else None,
-            clip_names=result.motion.clip_names,
+            clip_names=result.motion.clip_names, checkpoint=checkpoint,
         )  # fmt: skip
 
 
 def _report(
-    character: Character, result: "TrainResult", settings: TrainSettings, evaluation: "Evaluation", model_path: Path
-) -> list[Path]:
-    """Numbers, pictures and the page, beside the model; their paths."""
+    character: Character, result: "TrainResult", settings: TrainSettings, evaluation: "Evaluation", model_path: Path,
+    out: Path,
+) -> list[Path]:  # fmt: skip
+    """Numbers, pictures, times and the page; their paths."""
     from fitting.pictures import draw_pictures
     from fitting.report import write_report
 
     assert result.motion is not None
-    out = model_path.parent
-    numbers = out / "evaluation.json"
+    numbers = out / NUMBERS_FILE
     write_bytes(numbers, json.dumps(console.to_jsonable(evaluation.as_dict())).encode())
     console.announce("drawing ...")
     with result.timings.stage("pictures"):
         pictures = draw_pictures(character, result.motion, result.model, evaluation, out)
+    times = write_times(out, result.timings)
     report = write_report(out, result, settings, evaluation, model_path, pictures)
-    return [numbers, *(path for path, _ in pictures), report]
+    return [numbers, *(path for path, _ in pictures), times, report]
 
 
 def run_demo(options) -> None:
@@ -270,7 +297,7 @@ def run_demo(options) -> None:
     )
     train_and_report(
         open_character(None, 3000), settings, options.out, source=None, num_vertices=3000, study=False,
-        as_json=options.json,
+        restart=options.restart, as_json=options.json,
     )  # fmt: skip
 
 

@@ -1,14 +1,18 @@
 """What a model is trained on: shading points, poses and their baked visibility, in a resumable store on disk.
 
 The store is a zarr group with one chunk per frame. A frame is written whole, then its checksum; an interrupted bake
-continues with the frames whose checksum is missing or wrong and ends with the same bytes.
+continues with the frames whose checksum is missing or wrong and ends with the same bytes. zarr writes a chunk to a
+temporary file and renames it, but does not bring it to the disk first: after a power cut, the checksum tells.
 """
 
+import contextlib
 import json
+import os
+import secrets
 import shutil
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +23,15 @@ import zarr
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
+from fitting.checkpoint import first_difference
 from fitting.config import BakeSettings
+from fitting.lock import only_writer
 from fitting.motion import Motion
+from fitting.stages import Track, no_tracking
 from jaxrender.animation.skeleton import global_matrices
 from jaxrender.animation.skinning import Character, skin_mesh
 from jaxrender.checks import bad_input, check_finite
-from jaxrender.console import announce
+from jaxrender.console import to_jsonable
 from jaxrender.harmonics.visibility import VisibilityCaster, hemisphere_directions
 from jaxrender.scene import MeshSequence
 
@@ -112,14 +119,27 @@ def sequence_frames(sequence: MeshSequence) -> Callable[[int], PosedMesh]:
 class VisibilityStore:
     """Packed visibility of p points in f frames, on disk."""
 
-    def __init__(self, path: Path, *, num_frames: int, num_points: int, bake: BakeSettings, source: str):
-        """Opens the store at `path`, or makes it; one of other contents is replaced.
+    def __init__(
+        self,
+        path: Path,
+        *,
+        num_frames: int,
+        num_points: int,
+        bake: BakeSettings,
+        source: str,
+        run: Mapping[str, Any] | None = None,
+    ):
+        """Opens the store at `path`, or makes it.
 
         Args:
           source: hash of the character, its poses and points.
+          run: character and settings, to say what differs where the hash does.
+        Raises:
+          InputError: if something else is there: a bake of another character or of other settings, or a damaged one.
         """
         self.path, self.num_frames = path, num_frames
-        header: dict[str, Any] = {
+        # What is in the store follows from these.
+        contents: dict[str, Any] = {
             "format": "jaxrender-visibility",
             "version": STORE_VERSION,
             "source": source,
@@ -127,23 +147,24 @@ class VisibilityStore:
             "num_points": num_points,
             "num_directions": bake.num_directions,
         }
-        existing = _read_header(path)
-        self.resumed = existing == header
-        if not self.resumed:
-            if path.exists() and not (path / "zarr.json").is_file():
-                bad_input(path, "store", expected="nothing or a visibility store", got="something else")
-            if existing:
-                announce(f"{path} holds a bake of other settings or another character; it is made anew")
-            shutil.rmtree(path, ignore_errors=True)
-            group = zarr.create_group(path)
-            bytes_per_point = -(-bake.num_directions // 8)
-            shape = (num_frames, num_points, bytes_per_point)
-            group.create_array("visibility", shape=shape, chunks=(1, *shape[1:]), dtype="uint8")
-            group.create_array("checksum", shape=(num_frames,), chunks=(1,), dtype="uint64", fill_value=0)
-            # The header comes last: a store without it is taken for unfinished and made anew.
-            group.attrs.update(header)
-        self._visibility = zarr.open_array(path / "visibility", mode="r+")
-        self._checksum = zarr.open_array(path / "checksum", mode="r+")
+        shape = (num_frames, num_points, -(-bake.num_directions // 8))
+        if not path.exists():
+            with only_writer(path.parent):
+                _remove_unfinished(path)
+                _create(path, shape, {**contents, "run": to_jsonable(run or {})})
+        _refuse_another(path, contents, to_jsonable(run or {}))
+        try:
+            self._visibility = zarr.open_array(path / "visibility", mode="r+")
+            self._checksum = zarr.open_array(path / "checksum", mode="r+")
+        except (OSError, ValueError, KeyError) as error:
+            bad_input(path, "store", expected="whole descriptions of its arrays", got=f"{error}; {_WAY_OUT}")
+        if self._visibility.shape != shape or self._checksum.shape != shape[:1]:
+            bad_input(path, "store", expected=f"an array of shape {shape}", got=f"{self._visibility.shape}; {_WAY_OUT}")
+
+    def remove_leftovers(self) -> None:
+        """Removes what a killed process left half-written; only while nobody else writes."""
+        for file in self.path.rglob("*.partial"):
+            file.unlink(missing_ok=True)
 
     def missing(self) -> Int[np.ndarray, " n"]:
         """Frames not baked yet, and those that are not on disk as they were written."""
@@ -179,6 +200,56 @@ class VisibilityStore:
         return bits if bits is not None and _checksum(bits) == expected else None
 
 
+_WAY_OUT = "take another -o, or delete this folder, or add --restart to bake anew"
+
+
+def _create(path: Path, shape: tuple[int, int, int], header: dict[str, Any]) -> None:
+    """An empty store, made beside its place and renamed: a store that is there is whole."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    try:
+        group = zarr.create_group(temporary, attributes=header)
+        group.create_array("visibility", shape=shape, chunks=(1, *shape[1:]), dtype="uint8")
+        group.create_array("checksum", shape=shape[:1], chunks=(1,), dtype="uint64", fill_value=0)
+        for file in temporary.rglob("zarr.json"):
+            with file.open("rb") as handle:
+                os.fsync(handle.fileno())
+        temporary.rename(path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def remove_store(path: Path) -> None:
+    """Removes a visibility store, whatever it is of.
+
+    Raises:
+      InputError: if something else is there.
+    """
+    if path.exists() and not (path / "zarr.json").is_file():
+        bad_input(path, "store", expected="nothing or a visibility store", got="something else")
+    shutil.rmtree(path, ignore_errors=True)
+
+
+def _remove_unfinished(path: Path) -> None:
+    """Removes what a process left that was killed while it made a store."""
+    for left in path.parent.glob(f".{path.name}.*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _refuse_another(path: Path, contents: dict[str, Any], run: dict[str, Any]) -> None:
+    """Raises InputError unless the store holds these contents; names the setting that differs, if one is to blame."""
+    if not (path / "zarr.json").is_file():
+        bad_input(path, "store", expected="nothing or a visibility store", got="something else")
+    header = _read_header(path)
+    if header is None or header.get("format") != contents["format"]:
+        bad_input(path, "header", expected="that of a visibility store", got=f"damage; {_WAY_OUT}")
+    difference = first_difference({name: header.get(name) for name in contents}, contents)
+    if difference is not None:
+        field, there, here = first_difference(header.get("run", {}), run) or difference
+        bad_input(path, field, expected=f"{there}, as it was baked", got=f"{here}; {_WAY_OUT}")
+
+
 def _checksum(bits: UInt8[np.ndarray, "p bytes"]) -> int:
     """Never 0, which stands for a frame that is not there."""
     return 1 << 32 | zlib.crc32(np.ascontiguousarray(bits).data)
@@ -193,13 +264,16 @@ def _read_header(path: Path) -> dict | None:
 
 @dataclass(frozen=True)
 class BakeStatistics:
+    """Rays of the whole bake; those of the last run, which may have continued another, and how long they took."""
+
     num_rays: int
+    num_traced: int
     seconds: float
     frames_done_before: int
 
     @property
     def rays_per_second(self) -> float:
-        return self.num_rays / max(self.seconds, 1e-9)
+        return self.num_traced / max(self.seconds, 1e-9)
 
 
 def bake(
@@ -209,25 +283,34 @@ def bake(
     points: Int[np.ndarray, " p"],
     settings: BakeSettings,
     *,
-    track: Callable[[Iterator[int], int], Iterator[int]] = lambda frames, _: frames,
+    track: Track = no_tracking,
 ) -> BakeStatistics:
     """Traces every missing frame into the store.
 
     Args:
       frame: frame number -> posed mesh.
       track: wraps the iteration over frames, for progress display.
+    Raises:
+      InputError: if frames are missing and another run writes to the folder of the store.
+      OSError: if the disk is full; the frames before stay.
     """
     directions = hemisphere_directions(settings.num_directions)
     caster = VisibilityCaster(np.asarray(faces), directions, points=points, rays=settings.rays)
     missing = store.missing()
-    started, total = time.perf_counter(), store.num_frames
-    for index in track(iter(missing), len(missing)):
-        positions, frames = frame(int(index))
-        if not (np.isfinite(positions).all() and np.isfinite(frames).all()):
-            bad_input(f"frame {index}", "vertices", expected="finite numbers", got="NaN or Inf after skinning")
-        store.write(int(index), caster.cast(positions, frames))
+    started, total, rays_per_frame = time.perf_counter(), store.num_frames, len(points) * settings.num_directions
+    # A whole store is only read, also while another run holds the folder.
+    with only_writer(store.path.parent) if len(missing) else contextlib.nullcontext():
+        if len(missing):
+            store.remove_leftovers()
+        for index in track(iter(missing), total, "bake", total - len(missing)):
+            positions, frames = frame(int(index))
+            if not (np.isfinite(positions).all() and np.isfinite(frames).all()):
+                bad_input(f"frame {index}", "vertices", expected="finite numbers", got="NaN or Inf after skinning")
+            store.write(int(index), caster.cast(positions, frames))
     seconds = time.perf_counter() - started
-    return BakeStatistics(len(missing) * len(points) * settings.num_directions, seconds, total - len(missing))
+    return BakeStatistics(
+        total * rays_per_frame, len(missing) * rays_per_frame, seconds, frames_done_before=total - len(missing)
+    )
 
 
 def mean_visibility(bits: UInt8[np.ndarray, "f p bytes"], num_directions: int) -> Float[np.ndarray, "f p"]:

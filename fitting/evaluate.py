@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from fitting.checkpoint import NOTHING_KEPT, Arrays, Checkpoint
 from fitting.config import FitSettings
 from fitting.errors import ErrorSums, part_masks, relative_errors, sum_errors
 from fitting.fit import model_components, predict_sh
@@ -71,6 +72,7 @@ def evaluate(
     angles: tuple[Float[np.ndarray, "f 1 n"], FeatureBasis] | None = None,
     clip_names: tuple[str, ...] = (),
     track: Track = no_tracking,
+    checkpoint: Checkpoint = NOTHING_KEPT,
 ) -> Evaluation:
     """Measures `model` on all visible points and, if `study`, its competitors on some of them.
 
@@ -79,10 +81,11 @@ def evaluate(
       max_points: points of the study.
       angles: joint-angle features of the same frames (one group) and their unfitted basis, for comparison.
       clip_names: by the numbers in `data.clip`; else "clip 0" and so on.
+      checkpoint: keeps the parts that take seconds, and gives back those of an interrupted run.
     """
     real = np.flatnonzero(data.part != MIXED)
     part, clip = data.part[real], data.clip[real]
-    sums, mean_sums, point_errors, painted_on = _measure_model(data, model, real, track)
+    sums, mean_sums, point_errors, painted_on = _measure_model(data, model, real, track, checkpoint)
     return Evaluation(
         name=data.name,
         num_points=len(data.visible),
@@ -94,13 +97,17 @@ def evaluate(
         frames=FrameErrors(real, part, clip, sums.frame_curve()),
         point_errors=point_errors,
         painted_on=painted_on,
-        study=run_study(data, model, fit, ridge=ridge, max_points=max_points, angles=angles, track=track)
+        study=run_study(
+            data, model, fit, ridge=ridge, max_points=max_points, angles=angles, track=track, checkpoint=checkpoint
+        )
         if study
         else None,
     )
 
 
-def _measure_model(data: TrainingData, model: PoseModel, real: Int[np.ndarray, " f"], track: Track):
+def _measure_model(
+    data: TrainingData, model: PoseModel, real: Int[np.ndarray, " f"], track: Track, checkpoint: Checkpoint
+):
     """Errors of the model and of the mean, and the error of each point, a few blocks at a time."""
     components = model_components(model, data.raw[real])
     part = data.part[real]
@@ -109,22 +116,34 @@ def _measure_model(data: TrainingData, model: PoseModel, real: Int[np.ndarray, "
     points = np.flatnonzero(data.visible)
     points = points[np.argsort(data.groups[points], kind="stable")]
     chunks = np.array_split(points, max(1, len(points) // (8 * BLOCK)))
-    total, total_mean, point_errors = [], [], np.full(len(data.visible), np.nan)
-    for chunk in track(iter(chunks), len(chunks), "measure"):
+
+    def measure(chunk: Int[np.ndarray, " n"]) -> Arrays:
         baked = project(data.bits[real], chunk, data.table)
         predicted = predict_sh(model, components, chunk)
-        total.append(sum_errors(predicted, baked))
         mean = np.broadcast_to(baked[part == TRAIN].mean(axis=0), baked.shape)
-        total_mean.append(sum_errors(mean, baked))
         relative = relative_errors(predicted[painted], baked[painted])
-        point_errors[chunk] = np.sqrt(np.mean(relative**2, axis=0))
-    painted_on = "held-out frames" if held_out.any() else "training frames"
-    return (
-        functools.reduce(ErrorSums.__add__, total),
-        functools.reduce(ErrorSums.__add__, total_mean),
-        point_errors,
-        painted_on,
+        own, its = vars(sum_errors(predicted, baked)), vars(sum_errors(mean, baked))
+        by_kind = {
+            f"{kind}.{key}": value for kind, sums in (("own", own), ("mean", its)) for key, value in sums.items()
+        }
+        return by_kind | {"points": np.sqrt(np.mean(relative**2, axis=0))}
+
+    stage = checkpoint.stage("measure", data, model)
+    # Sums of floats depend on their order, and kept parts come first: they are put in order before they are added.
+    found = dict(stage.parts(chunks, measure, track=track, label="measure"))
+    point_errors = np.full(len(data.visible), np.nan)
+    for number, chunk in enumerate(chunks):
+        point_errors[chunk] = found[number]["points"]
+    own, mean = (
+        functools.reduce(ErrorSums.__add__, [_error_sums(found[i], kind) for i in range(len(chunks))])
+        for kind in ("own", "mean")
     )
+    return own, mean, point_errors, "held-out frames" if held_out.any() else "training frames"
+
+
+def _error_sums(part: Arrays, kind: str) -> ErrorSums:
+    error, truth, relative, squares, count = (part[f"{kind}.{field.name}"] for field in dataclasses.fields(ErrorSums))
+    return ErrorSums(error, truth, relative, squares, int(count))
 
 
 def _part_tables(sums: ErrorSums, part: Int[np.ndarray, " f"]) -> dict[str, dict | None]:

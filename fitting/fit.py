@@ -1,5 +1,6 @@
 """The fit of all points, block by block: greedy axes, linear solve, joint refinement, offset."""
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from fitting.checkpoint import NOTHING_KEPT, Arrays, Checkpoint, Stage
 from fitting.config import FitSettings
 from fitting.features import fit_basis
 from fitting.solve import (
@@ -29,7 +31,6 @@ from fitting.stages import Track, no_tracking
 from fitting.training_data import TrainingData
 from jaxrender.harmonics.pose_model import FeatureBasis, PoseModel
 from jaxrender.harmonics.zh_fit import spread_start_axes
-from jaxrender.machine import on_all_cores
 
 NUM_STARTS = 3
 
@@ -67,10 +68,22 @@ def pose_rows(
     return PoseRows(*(jnp.asarray(x, jnp.float32) for x in (components, weights[used], moments[group], lam)))
 
 
-def fit_model(data: TrainingData, fit: FitSettings, *, ridge: float, track: Track = no_tracking) -> PoseModel:
-    """Solves for all visible points, block by block, and assembles the model."""
+def fit_model(
+    data: TrainingData,
+    fit: FitSettings,
+    *,
+    ridge: float,
+    track: Track = no_tracking,
+    checkpoint: Checkpoint = NOTHING_KEPT,
+) -> PoseModel:
+    """Solves for all visible points, block by block, and assembles the model.
+
+    Args:
+      checkpoint: keeps each block when it is solved, and gives back those of an interrupted run.
+    """
     weights = data.frame_weights(fit.mixed_weight)
-    basis, moments = fit_basis(data.basis, data.raw, weights, fit.num_components)
+    stage = checkpoint.stage("fit", data, fit, ridge)
+    basis, moments = _kept_basis(data, weights, fit, stage)
     used, k, p = weights > 0, moments.shape[1], len(data.points.vertices)
     numbers = np.zeros((k + 1, 6 * fit.num_lobes, p), np.float16 if fit.half_precision else np.float32)
     axes = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (p, fit.num_lobes, 1))
@@ -78,16 +91,14 @@ def fit_model(data: TrainingData, fit: FitSettings, *, ridge: float, track: Trac
     todo = blocks(data.groups, np.flatnonzero(data.visible))
     bits = data.bits[used]
 
-    def solve(block: Block):
+    def solve(block: Block) -> Arrays:
         rows = pose_rows(data, basis, moments, weights, block.group, ridge)
-        return fit_block(rows, block_sh(bits[:, block.padded], data.table), fit)
+        return block_arrays(fit_block(rows, block_sh(bits[:, block.padded], data.table), fit))
 
-    # XLA runs each block on its calling thread (jaxrender.machine); two blocks at a time keep two cores busy.
-    solutions = on_all_cores(solve, todo)
-    for block in track(iter(todo), len(todo), "fit"):
-        solved, n = next(solutions), len(block.points)
-        numbers[..., block.points] = np.swapaxes(solved[0], 1, 2)[..., :n]
-        axes[block.points], offset[block.points] = solved[1][:n], solved[2][:n]
+    for number, solved in stage.parts(todo, solve, track=track, label="fit"):
+        points, n = todo[number].points, len(todo[number].points)
+        numbers[..., points] = np.swapaxes(solved["weights"], 1, 2)[..., :n]
+        axes[points], offset[points] = solved["axes"][:n], solved["offset"][:n]
     return PoseModel(
         features=basis,
         weights=jnp.asarray(numbers),
@@ -97,6 +108,25 @@ def fit_model(data: TrainingData, fit: FitSettings, *, ridge: float, track: Trac
         points=jnp.asarray(data.points.of_vertex, jnp.int32),
         visible=jnp.asarray(data.visible),
     )
+
+
+def _kept_basis(
+    data: TrainingData, weights: Float[np.ndarray, " f"], fit: FitSettings, stage: Stage
+) -> tuple[FeatureBasis, Float[np.ndarray, "g k"]]:
+    """`fit_basis` once per run: its last bits may depend on the number of cores, and all blocks need the same ones."""
+
+    def compute() -> Arrays:
+        basis, moments = fit_basis(data.basis, data.raw, weights, fit.num_components)
+        return {"mean": np.asarray(basis.mean), "basis": np.asarray(basis.basis), "moments": moments}
+
+    found = stage.part("basis", compute)
+    axes = dataclasses.replace(data.basis, mean=jnp.asarray(found["mean"]), basis=jnp.asarray(found["basis"]))
+    return axes, found["moments"]
+
+
+def block_arrays(solved: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Arrays:
+    """What `fit_block` returns, by name."""
+    return dict(zip(("weights", "axes", "offset"), solved, strict=True))
 
 
 def fit_block(

@@ -24,6 +24,9 @@ MODEL_FILE = "model.safetensors"
 def model_header(result: TrainResult, settings: TrainSettings, *, source: dict, errors: dict) -> dict:
     """What a reader of the file has to know, and what a person would ask.
 
+    Nothing here depends on the clock or on interruptions: the same run ends with the same file, bit by bit. Times are
+    in a file beside it (fitting.stages.TIMES_FILE).
+
     Args:
       source: name, content hash, input file and mesh size of what the model was trained on.
       errors: the evaluation's numbers.
@@ -40,7 +43,6 @@ def model_header(result: TrainResult, settings: TrainSettings, *, source: dict, 
         "source": source,
         "settings": settings.as_dict(),
         "ridge": result.ridge,
-        "seconds": dict(result.timings.seconds),
         "rays": result.bake.num_rays,
         "invisible_points": int((~np.asarray(model.visible)).sum()),
         "errors": errors,
@@ -85,7 +87,6 @@ _HEADER: dict[str, tuple[type, ...]] = {
     "source.input": (str, NoneType),
     "source.num_vertices": (int,),
     "ridge": (int, float),
-    "seconds": (dict,),
     "rays": (int,),
 }
 

@@ -41,6 +41,11 @@ from jaxrender.io.hdr import read_environment
 from jaxrender.io.picture import side_by_side, to_bytes, tone_map, write_animation, write_png
 from jaxrender.metrics import heatmap
 
+#: What `draw_pictures` writes: stills, and films.
+STILLS = ("key_light.png", "diffuse.png", "phong.png", "membrane.png", "error_on_mesh.png")
+FILMS = ("film.webp", "membrane.webp")
+PICTURES = (*STILLS, *FILMS)
+
 MEMBRANE_TRANSMISSION = (0.75, 0.4, 0.22)
 # Stills show shape and shadow, not the character's paint.
 CLAY = (0.6, 0.57, 0.53)
@@ -193,19 +198,20 @@ def draw_pictures(
     where = f"{motion.clip_names[motion.clip[index]]}, {motion.time[index]:.2f} s"
     held = "held out of training" if motion.part[index] != 0 else "a training frame"
     scale = "(white: a quarter of the bright tone)"
+    key, diffuse, phong, thin, painted = (out / name for name in STILLS)
     pictures = [
-        (still.comparison(out / "key_light.png", "diffuse", lamp),
+        (still.comparison(key, "diffuse", lamp),
          f"Diffuse under one lamp of order 4 from the upper left ({where}, {held}): without shadows, the model, traced "
          f"visibility under the same light, and the difference {scale}."),
-        (still.comparison(out / "diffuse.png", "diffuse", sky), "Diffuse under the built-in sky."),
-        (still.comparison(out / "phong.png", "phong", sky, exponent=12.0), "Phong, exponent 12, local viewer."),
-        (still.comparison(out / "membrane.png", "membrane", turn_light(sky, 2.4)),
+        (still.comparison(diffuse, "diffuse", sky), "Diffuse under the built-in sky."),
+        (still.comparison(phong, "phong", sky, exponent=12.0), "Phong, exponent 12, local viewer."),
+        (still.comparison(thin, "membrane", turn_light(sky, 2.4)),
          "Thin membrane, lit from behind: front light is shadowed, back light is not, as in the paper."),
-        (still.painted(out / "error_on_mesh.png", evaluation.point_errors),
+        (still.painted(painted, evaluation.point_errors),
          f"RMS relative SH error of each point over {evaluation.painted_on}, from the front and from behind; pale "
          "yellow is 0.5 and more, dark is 0, grey sees nothing and was not measured."),
     ]  # fmt: skip
-    film, sweep = out / "film.webp", out / "membrane.webp"
+    film, sweep = (out / name for name in FILMS)
     poses = pose_at_frames(character, 0, fps=12.0, max_frames=36)
     settings = Film(size=(320, 320), exponents=(1.0, 64.0))
     write_animation(film, film_frames(character, model, poses, environment, settings), fps=12.0)

@@ -16,6 +16,7 @@ from jaxrender import console
 from jaxrender.io.report import Report
 from jaxrender.machine import cpu_model, num_cores
 
+REPORT_FILE = "report.html"
 SETS = {"train": "training", "segments": "held-out segments", "clips": "held-out clips"}
 
 
@@ -41,7 +42,7 @@ def write_report(
     if evaluation.study is not None:
         _study(report, evaluation.study)
     _run(report, result, settings)
-    return Path(report.write(out / "report.html"))
+    return Path(report.write(out / REPORT_FILE))
 
 
 def _subtitle(result: TrainResult, evaluation: Evaluation) -> str:

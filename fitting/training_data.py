@@ -95,7 +95,7 @@ def bake_character(
     source = _source_hash(character.content_hash, [*arrays, points.vertices, np.asarray(character.faces)])
     data, statistics = _bake(
         character.name, frames, character.faces, points, groups, raw, basis, motion.part, motion.clip,
-        source, settings, store, track,
+        source, {"character": character_identity(character)}, settings, store, track,
     )  # fmt: skip
     if settings.bake.max_points:
         points = represent_by_visible(character, points, data.visible)
@@ -143,17 +143,22 @@ def bake_sequence(
     source = _source_hash(name, [np.asarray(array) for array in arrays])
     return _bake(
         name, frames, sequence.faces, ShadingPoints(vertices, vertices), np.zeros(num_vertices, np.int32), raw, basis,
-        part, np.zeros(num_frames, int), source, settings, store, track,
+        part, np.zeros(num_frames, int), source, {"mesh sequence": name}, settings, store, track,
     )  # fmt: skip
 
 
-def _bake(name, frames, faces, points, groups, raw, basis, part, clip, source, settings, store_path, track):
+def character_identity(character: Character) -> str:
+    """Name and hash, for messages."""
+    return f"{character.name} {character.content_hash[:12]}"
+
+
+def _bake(name, frames, faces, points, groups, raw, basis, part, clip, source, run, settings, store_path, track):
+    # The fit does not matter to the bake.
+    run = {**run, "bake": dataclasses.asdict(settings.bake), "split": dataclasses.asdict(settings.split)}
     store = VisibilityStore(
-        store_path, num_frames=len(part), num_points=len(points.vertices), bake=settings.bake, source=source
+        store_path, num_frames=len(part), num_points=len(points.vertices), bake=settings.bake, source=source, run=run
     )
-    statistics = bake(
-        store, frames, faces, points.vertices, settings.bake, track=lambda items, count: track(items, count, "bake")
-    )
+    statistics = bake(store, frames, faces, points.vertices, settings.bake, track=track)
     bits = store.read()
     visible = mean_visibility(bits[part == TRAIN], settings.bake.num_directions).mean(axis=0) >= INVISIBLE_BELOW
     if not visible.any():

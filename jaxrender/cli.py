@@ -22,6 +22,8 @@ class Demo:
     """Folder for the model, the pictures and the report."""
     seed: int = 0
     """Seed of everything random."""
+    restart: bool = False
+    """Begin anew: throw away what an earlier run left in the folder."""
     json: bool = False
     """Print one JSON object instead of the list of files."""
 

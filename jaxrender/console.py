@@ -1,7 +1,8 @@
 """The manners all commands share: parsing, progress, errors, exit status, the compilation cache.
 
 Results go to standard output, everything said on the way to standard error, so `--json` can be piped.
-Exit status: 0 done; 1 a fault of ours; 2 bad input or arguments, told in one line; 130 after Ctrl-C.
+Exit status: 0 done; 1 a fault of ours; 2 bad input or arguments, a full disk or too little memory, told in one line;
+130 after Ctrl-C; 143 after a request to end (SIGTERM).
 """
 
 import contextlib
@@ -10,7 +11,9 @@ import enum
 import json
 import os
 import pathlib
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -46,38 +49,87 @@ def parse(commands: Any, *, prog: str, description: str = "", argv: list[str] | 
 def run_command(main: Callable[[], object]) -> int:
     """Runs `main` and returns the exit status of the process; no exception but `SystemExit` leaves as itself.
 
-    Bad data (`InputError`), bad arguments (`ValueError`) and files that cannot be read or written
-    (`OSError`) become one line and status 2. After Ctrl-C the notes that `keeping` left are printed, and
-    the status is 130. Anything else is a fault of ours: one line, status 1, and how to see the traceback.
+    Bad data (`InputError`), bad arguments (`ValueError`), files that cannot be read or written (`OSError`)
+    and too little memory become one line and status 2. Ctrl-C and SIGTERM, which are taken alike, end
+    with status 130 and 143. The notes that `keeping` left are part of the line. Anything else is a fault
+    of ours: one line, status 1, and how to see the traceback.
     """
     try:
-        main()
+        with _terminated_like_ctrl_c():
+            main()
         sys.stdout.flush()
         return 0
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 2
+    except Terminated as stop:
+        announce(f"terminated{_notes(stop)}")
+        return 128 + signal.SIGTERM
     except KeyboardInterrupt as stop:
-        announce("interrupted" + "".join(f"; {note}" for note in getattr(stop, "__notes__", [])))
-        return 130
+        announce(f"interrupted{_notes(stop)}")
+        return 128 + signal.SIGINT
     except BrokenPipeError:
         # The reader (`| head`) has gone. Python would complain once more when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except (jaxrender.checks.InputError, ValueError, OSError, MemoryError) as error:
-        return _fail(error, _one_line(error), status=2)
+    except (jaxrender.checks.InputError, ValueError, OSError) as error:
+        return _fail(error, _one_line(error) + _notes(error), status=2)
     except Exception as error:
+        if _out_of_memory(error):
+            return _fail(error, f"not enough memory: {_one_line(error)}".removesuffix(": ") + _notes(error), status=2)
         text = f"internal error: {type(error).__name__}: {_one_line(error)}"
         return _fail(error, f"{text} (set {DEBUG_VARIABLE}=1 for the traceback)", status=1)
 
 
 @contextlib.contextmanager
 def keeping(note: str) -> Iterator[None]:
-    """Says `note` if Ctrl-C interrupts the block: what was kept, and how to go on from there."""
+    """Says `note` if the block ends before its time: what was kept, and how to go on from there.
+
+    That is after Ctrl-C or SIGTERM, when a file cannot be written (a full disk), and when memory runs out.
+    """
     try:
         yield
-    except KeyboardInterrupt as stop:
+    except (KeyboardInterrupt, OSError) as stop:
         stop.add_note(note)
         raise
+    except Exception as error:
+        if _out_of_memory(error):
+            error.add_note(note)
+        raise
+
+
+class Terminated(KeyboardInterrupt):
+    """Somebody asked the process to end, by SIGTERM."""
+
+
+@contextlib.contextmanager
+def _terminated_like_ctrl_c() -> Iterator[None]:
+    """SIGTERM raises `Terminated` during the block, so that what is open is closed and said."""
+    # Signals are the main thread's, and a handler that is there already is somebody's purpose.
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    ):
+        yield
+        return
+
+    def stop(*_: object) -> None:
+        raise Terminated
+
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """Of Python and NumPy, or of a device of JAX."""
+    is_of_jax = isinstance(error, jax.errors.JaxRuntimeError) and str(error).startswith("RESOURCE_EXHAUSTED")
+    return isinstance(error, MemoryError) or is_of_jax
+
+
+def _notes(error: BaseException) -> str:
+    return "".join(f"; {note}" for note in getattr(error, "__notes__", []))
 
 
 def _fail(error: BaseException, text: str, *, status: int) -> int:
@@ -89,7 +141,7 @@ def _fail(error: BaseException, text: str, *, status: int) -> int:
 
 def _one_line(error: BaseException) -> str:
     if isinstance(error, MemoryError):
-        return " ".join(f"not enough memory {error}".split())
+        return " ".join(str(error).split())
     if isinstance(error, OSError) and error.strerror:
         names = [str(name) for name in (error.filename, error.filename2) if name is not None]
         return ": ".join([*names, error.strerror])
@@ -158,9 +210,9 @@ def progress(label: str, *, total: int, unit: str = "", done: int = 0) -> Iterat
         yield advance
 
 
-def track(items: Iterable, label: str, *, total: int, unit: str = "") -> Iterator:
+def track(items: Iterable, label: str, *, total: int, unit: str = "", done: int = 0) -> Iterator:
     """Goes through `items` under `progress`."""
-    with progress(label, total=total, unit=unit) as advance:
+    with progress(label, total=total, unit=unit, done=done) as advance:
         for item in items:
             yield item
             advance(1)

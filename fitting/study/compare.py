@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
+from fitting.checkpoint import NOTHING_KEPT, Checkpoint
 from fitting.config import FitSettings
 from fitting.errors import SH, ByPart
 from fitting.fit import blocks, model_components, predict_sh
@@ -74,6 +75,7 @@ def run_study(
     max_points: int,
     angles: Angles | None,
     track: Track = no_tracking,
+    checkpoint: Checkpoint = NOTHING_KEPT,
 ) -> Study:
     """All methods on `max_points` visible points."""
     points = some_points(data, max_points)
@@ -81,7 +83,7 @@ def run_study(
     linear = ground.linear.predict(ground.sh)
     kernel = KernelPose(ground.data, ground.linear.weights).predict(ground.sh)
     offset = fit.offset
-    refined = {c: refined_lobes(ground, c, offset=offset, track=track) for c in LOBE_COUNTS}
+    refined = {c: refined_lobes(ground, c, offset=offset, track=track, checkpoint=checkpoint) for c in LOBE_COUNTS}
     axes = {c: point_axes(ground, c) for c in LOBE_COUNTS}
     own = predict_sh(model, model_components(model, data.raw), points)
     rows = [
@@ -92,7 +94,7 @@ def run_study(
         method_row(ground, "the trained model", 6 * model.num_lobes, own),
         method_row(ground, "Gaussian kernel, 16 SH", 16, kernel, note="the nonlinear reference"),
     ]
-    few, both, subset = _subset(ground, refined, axes, angles, track)
+    few, both, subset = _subset(ground, refined, axes, angles, track, checkpoint)
     return Study(
         points=points,
         rows=rows,
@@ -106,7 +108,12 @@ def run_study(
 
 
 def _subset(
-    ground: Ground, refined: dict[int, SH], axes: dict[int, np.ndarray], angles: Angles | None, track: Track
+    ground: Ground,
+    refined: dict[int, SH],
+    axes: dict[int, np.ndarray],
+    angles: Angles | None,
+    track: Track,
+    checkpoint: Checkpoint,
 ) -> tuple[Ground, dict[tuple[int, bool], SH], list[MethodRow]]:
     """`subset_rows` on whole blocks of points, spread over the groups; and their ground and refined predictions."""
     found = [block.points for block in blocks(ground.data.groups, ground.all_points, size=STUDY_BLOCK)]
@@ -115,9 +122,13 @@ def _subset(
     fit = ground.fit
     few = make_ground(thin(ground.data, some), fit, ground.linear.ridge)
     both = {(c, fit.offset): refined[c][:, some] for c in LOBE_COUNTS}
-    both |= {(c, not fit.offset): refined_lobes(few, c, offset=not fit.offset, track=track) for c in LOBE_COUNTS}
+    both |= {
+        (c, not fit.offset): refined_lobes(few, c, offset=not fit.offset, track=track, checkpoint=checkpoint)
+        for c in LOBE_COUNTS
+    }
     paper = linear_pose(with_angles(few.data, angles), fit, ground.linear.ridge) if angles else None
-    return few, both, list(subset_rows(few, both, {c: a[some] for c, a in axes.items()}, paper, track))
+    rows = subset_rows(few, both, {c: a[some] for c, a in axes.items()}, paper, track, checkpoint)
+    return few, both, rows
 
 
 def goals(rows: list[MethodRow], subset: list[MethodRow], fit: FitSettings) -> list[Goal]:

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from fitting.checkpoint import Arrays, Checkpoint, as_arrays, from_arrays
 from fitting.errors import SH
-from fitting.fit import Block, blocks, fit_block, predict_block, start_axes
+from fitting.fit import Block, block_arrays, blocks, fit_block, predict_block, start_axes
 from fitting.solve import ORDER, lobe_targets, padded, synthesize
 from fitting.stages import Track
 from fitting.study.ground import Ground, LinearPose, MethodRow, method_row
@@ -149,20 +150,22 @@ def fixed_axis_lobes(ground: Ground, axes: Float[np.ndarray, "n c 3"]) -> SH:
     return np.asarray(_from_charts(ground.linear.predict(numbers), axes))
 
 
-def refined_lobes(ground: Ground, num_lobes: int, *, offset: bool, track: Track) -> SH:
+def refined_lobes(ground: Ground, num_lobes: int, *, offset: bool, track: Track, checkpoint: Checkpoint) -> SH:
     """The training proper (fit_block) for another number of lobes, in blocks small enough for a few points a group."""
     fit = dataclasses.replace(ground.fit, num_lobes=num_lobes, offset=offset)
     linear, used, result = ground.linear, ground.linear.weights > 0, np.empty_like(ground.sh)
     todo = blocks(ground.data.groups, ground.all_points, size=STUDY_BLOCK)
 
-    def solve(block: Block) -> SH:
-        fitted = fit_block(linear.rows(block.group), ground.sh[used][:, block.padded], fit)
-        components = linear.components[:, block.group].astype(np.float32)
-        return np.asarray(predict_block(components, *fitted))[:, : len(block.points)]
+    def solve(block: Block) -> Arrays:
+        return block_arrays(fit_block(linear.rows(block.group), ground.sh[used][:, block.padded], fit))
 
-    solved = on_all_cores(solve, todo)
-    for block in track(iter(todo), len(todo), count_lobes(num_lobes)):
-        result[:, block.points] = next(solved)
+    name = f"study_{num_lobes}_lobes_{'offset' if offset else 'plain'}"
+    stage = checkpoint.stage(name, ground.data, linear, fit)
+    for number, fitted in stage.parts(todo, solve, track=track, label=count_lobes(num_lobes)):
+        block = todo[number]
+        components = linear.components[:, block.group].astype(np.float32)
+        predicted = predict_block(components, fitted["weights"], fitted["axes"], fitted["offset"])
+        result[:, block.points] = np.asarray(predicted)[:, : len(block.points)]
     return result
 
 
@@ -195,7 +198,8 @@ def subset_rows(
     axes: dict[int, np.ndarray],
     joint_angles: LinearPose | None,
     track: Track,
-) -> Iterator[MethodRow]:
+    checkpoint: Checkpoint,
+) -> list[MethodRow]:
     """From the paper's way to the refined model on the same few points and frames.
 
     Args:
@@ -203,15 +207,33 @@ def subset_rows(
       refined: by number of lobes and offset.
       axes: of each point, by number of lobes.
     """
-    yield method_row(ground, "mean visibility", 0, np.broadcast_to(ground.sh[ground.train].mean(0), ground.sh.shape))
-    yield method_row(ground, "linear, 16 SH", 16, ground.linear.predict(ground.sh))
-    for c in track(iter(LOBE_COUNTS), len(LOBE_COUNTS), "fits per frame"):
-        kinds = {raw_label(c): ground.linear} | ({paper_label(c): joint_angles} if joint_angles else {})
-        fitted, predicted = raw_angle_lobes(ground, c, list(kinds.values()))
-        yield method_row(ground, f"{count_lobes(c)}, fit per frame, no pose model", 6 * c, fitted)
-        for label, sh in zip(kinds, predicted, strict=True):
-            yield method_row(ground, label, 6 * c, sh)
-        yield method_row(ground, f"{count_lobes(c)}, anchored charts", 6 * c, anchored_lobes(ground, axes[c]))
-        yield method_row(ground, f"{count_lobes(c)}, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
-        for offset in (False, True):
-            yield method_row(ground, refined_label(c, offset), 6 * c, refined[c, offset])
+    stage = checkpoint.stage("study_per_frame", ground.data, ground.linear, joint_angles)
+    mean = np.broadcast_to(ground.sh[ground.train].mean(0), ground.sh.shape)
+    rows = [
+        method_row(ground, "mean visibility", 0, mean),
+        method_row(ground, "linear, 16 SH", 16, ground.linear.predict(ground.sh)),
+    ]
+
+    def per_frame(c: int) -> Arrays:
+        return as_arrays(list(_rows_per_frame(ground, c, axes[c], joint_angles)))
+
+    slow = dict(stage.parts(LOBE_COUNTS, per_frame, track=track, label="fits per frame", one_by_one=True))
+    for c in LOBE_COUNTS:
+        rows += [MethodRow(**row) for row in from_arrays(slow[LOBE_COUNTS.index(c)])]
+        rows.append(
+            method_row(ground, f"{count_lobes(c)}, axes fixed per point", 6 * c, fixed_axis_lobes(ground, axes[c]))
+        )
+        rows += [method_row(ground, refined_label(c, offset), 6 * c, refined[c, offset]) for offset in (False, True)]
+    return rows
+
+
+def _rows_per_frame(
+    ground: Ground, c: int, axes: Float[np.ndarray, "n c 3"], joint_angles: LinearPose | None
+) -> Iterator[MethodRow]:
+    """The methods that fit c lobes to every frame on its own, which takes seconds."""
+    kinds = {raw_label(c): ground.linear} | ({paper_label(c): joint_angles} if joint_angles else {})
+    fitted, predicted = raw_angle_lobes(ground, c, list(kinds.values()))
+    yield method_row(ground, f"{count_lobes(c)}, fit per frame, no pose model", 6 * c, fitted)
+    for label, sh in zip(kinds, predicted, strict=True):
+        yield method_row(ground, label, 6 * c, sh)
+    yield method_row(ground, f"{count_lobes(c)}, anchored charts", 6 * c, anchored_lobes(ground, axes))

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import glob
 import os
 import pathlib
 import secrets
@@ -44,6 +45,13 @@ def atomic_path(path: str | os.PathLike) -> Iterator[pathlib.Path]:
     # The rename itself is an entry of the folder. Some systems cannot open a folder for this.
     with contextlib.suppress(OSError):
         _sync(path.parent)
+
+
+def remove_leftovers(path: str | os.PathLike) -> None:
+    """Removes the temporary files of `path` that killed processes left; only while nobody else writes it."""
+    path = pathlib.Path(path)
+    for left in path.parent.glob(f".{glob.escape(path.stem)}.{'[0-9a-f]' * 8}{glob.escape(path.suffix)}"):
+        left.unlink(missing_ok=True)
 
 
 def write_bytes(path: str | os.PathLike, data: bytes) -> None:
