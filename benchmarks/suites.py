@@ -23,6 +23,7 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "harmonics": "benchmarks.harmonics",
         "pathtrace": "benchmarks.pathtrace",
         "raster": "benchmarks.raster",
+        "resume": "benchmarks.resume",
     }
 )
 

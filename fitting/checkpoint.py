@@ -185,7 +185,7 @@ class Stage:
             path.unlink()
             foreign += not path.name.startswith(".")
         if foreign:
-            announce(f"{self.name}: {foreign} parts were computed by another version or from other data; again")
+            announce(f"{self.name}: {foreign} kept parts are of another version or of other data; computed again")
 
     def _path(self, part: str) -> Path:
         assert self.checkpoint.folder is not None
@@ -225,6 +225,7 @@ def _feed(update: Callable[[Any], None], value: Any) -> None:
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         _feed(update, [type(value).__name__, {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}])
     elif isinstance(value, Mapping):
+        update(b"mapping;")
         _feed(update, list(value.items()))
     elif isinstance(value, list | tuple):
         update(f"list {len(value)};".encode())

@@ -89,12 +89,16 @@ def keeping(note: str) -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, OSError) as stop:
-        stop.add_note(note)
+        stop.add_note(_Kept(note))
         raise
     except Exception as error:
         if _out_of_memory(error):
-            error.add_note(note)
+            error.add_note(_Kept(note))
         raise
+
+
+class _Kept(str):
+    """A note of ours: JAX leaves some on its errors too."""
 
 
 class Terminated(KeyboardInterrupt):
@@ -129,7 +133,7 @@ def _out_of_memory(error: Exception) -> bool:
 
 
 def _notes(error: BaseException) -> str:
-    return "".join(f"; {note}" for note in getattr(error, "__notes__", []))
+    return "".join(f"; {note}" for note in getattr(error, "__notes__", []) if isinstance(note, _Kept))
 
 
 def _fail(error: BaseException, text: str, *, status: int) -> int:

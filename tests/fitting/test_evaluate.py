@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fitting import errors
+from fitting.checkpoint import Checkpoint
 from fitting.config import FitSettings
 from fitting.evaluate import evaluate
 from fitting.fit import fit_model, model_components, predict_sh
@@ -93,6 +94,37 @@ def test_error_sums_add_up_over_points():
     both = errors.sum_errors(a[:, :2], b[:, :2]) + errors.sum_errors(a[:, 2:], b[:, 2:])
     np.testing.assert_allclose(both.frame_curve()["std"], errors.sum_errors(a, b).frame_curve()["std"], rtol=1e-5)
     assert both.num_points == 6
+
+
+def test_an_interrupted_study_continues_and_ends_with_the_same_numbers(data, model, full, tmp_path):
+    angles = data.raw[:, :1] * np.float32(0.5), made_up_basis("exponential_map", 1)
+    options = {"ridge": 0.01, "angles": angles, "clip_names": ("walk", "turn")}
+
+    class Stop(Exception):
+        pass
+
+    def stop_in(label, number):
+        def track(items, _count, own, _done):
+            for index, item in enumerate(items):
+                if own == label and index == number:
+                    raise Stop
+                yield item
+
+        return track
+
+    for label, number in (("measure", 0), ("2 lobes", 1), ("3 lobes", 0), ("fits per frame", 2)):
+        with pytest.raises(Stop):
+            parts = Checkpoint(tmp_path / "c")
+            evaluate(data, model, FIT, track=stop_in(label, number), checkpoint=parts, **options)
+    seen = {}
+
+    def count(items, total, label, done):
+        seen.setdefault(label, []).append((total, done))
+        return items
+
+    found = evaluate(data, model, FIT, track=count, checkpoint=Checkpoint(tmp_path / "c"), **options)
+    assert seen["fits per frame"] == [(3, 2)] and all(total == done for total, done in seen["2 lobes"])
+    assert to_jsonable(found.as_dict()) == to_jsonable(full.as_dict())
 
 
 def test_study_knows_better_from_worse(full):

@@ -109,7 +109,7 @@ def test_an_interrupted_bake_continues_and_ends_with_the_same_bits(trained, char
     class Stop(Exception):
         pass
 
-    def stop_after_seven(items, count, label):
+    def stop_after_seven(items, _count, label, _done):
         for number, item in enumerate(items):
             if label == "bake" and number == 7:
                 raise Stop
@@ -153,12 +153,14 @@ def test_no_visible_vertex_is_left_to_a_point_that_sees_nothing(trained, charact
     np.testing.assert_array_equal(points.of_vertex[points.vertices], np.arange(len(visible)))
 
 
-def test_a_store_of_other_contents_is_replaced_and_a_foreign_folder_refused(tmp_path):
+def test_a_store_of_other_contents_and_a_foreign_folder_are_refused(tmp_path):
     bake = BakeSettings(num_directions=64)
     store = VisibilityStore(tmp_path / "s", num_frames=2, num_points=3, bake=bake, source="a")
     store.write(0, np.zeros((3, 8), np.uint8))
     assert list(VisibilityStore(tmp_path / "s", num_frames=2, num_points=3, bake=bake, source="a").missing()) == [1]
-    assert list(VisibilityStore(tmp_path / "s", num_frames=2, num_points=3, bake=bake, source="b").missing()) == [0, 1]
+    with pytest.raises(InputError, match="source: expected a, as it was baked, got b; take another -o, or delete"):
+        VisibilityStore(tmp_path / "s", num_frames=2, num_points=3, bake=bake, source="b")
+    assert list(VisibilityStore(tmp_path / "s", num_frames=2, num_points=3, bake=bake, source="a").missing()) == [1]
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match="something else"):
