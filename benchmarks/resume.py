@@ -1,8 +1,8 @@
 """Training killed at random moments: what is done twice, and whether the model is the uninterrupted one, bit by bit.
 
-A small training with its study and pictures runs as a process and is killed (SIGKILL) after a time drawn evenly from
-the time of an uninterrupted one, again and again until one comes through; then the next folder begins. A file that
-was whole on disk and is written again counts as done twice.
+A small training runs as a process and is killed (SIGKILL) after a time drawn evenly from that of an uninterrupted one,
+again and again until one comes through; then the next folder begins. A frame of the bake or a part that was whole on
+disk and is written again counts as done twice.
 """
 
 import os
@@ -11,101 +11,116 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
 from benchmarks.suites import Measurement, Options
+from fitting.cli import NUMBERS_FILE
 from fitting.model import MODEL_FILE
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 FRAMES, PARTS = "bake.zarr/visibility/c/**/0", "unfinished/*/*.part"
 TRAIN = (
-    "train", "--num-vertices", "800", "--bake.max-points", "60", "--bake.max-frames", "24", "--bake.num-mixed", "8",
-    "--bake.num-directions", "256", "--fit.num-components", "6", "--fit.refine-steps", "6",
+    "train", "--num-vertices", "800", "--bake.max-points", "60", "--bake.num-directions", "256",
+    "--fit.num-components", "6",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Size:
-    """How much of it: kills in all, and further options of the training."""
+class Case:
+    """A training, how often it is killed, and whether it runs to its end or to the model, before the pictures."""
 
+    options: tuple[str, ...]
     kills: int = 50
-    options: Sequence[str] = ()
+    to_model: bool = False
+
+    @property
+    def last_file(self) -> str:
+        return MODEL_FILE if self.to_model else NUMBERS_FILE
 
 
-QUICK = Size(kills=2, options=("--no-study", "--fit.num-lobes", "1", "--fit.refine-steps", "2"))
+FEW_FRAMES = ("--bake.max-frames", "24", "--bake.num-mixed", "8", "--fit.refine-steps", "6")
+CASES: Mapping[str, Case] = MappingProxyType(
+    {
+        "fit": Case((*FEW_FRAMES, "--no-study"), to_model=True),
+        "whole": Case(FEW_FRAMES),
+    }
+)
 
 
 def run(options: Options) -> Iterator[Measurement]:
-    """The case "kill": one row for each folder, and one for all."""
-    if not options.wants("kill"):
-        return
-    size, rng = QUICK if options.quick else Size(), np.random.default_rng(options.seed)
-    with tempfile.TemporaryDirectory() as place:
-        folder = pathlib.Path(place)
-        _train(folder / "programs", size, folder, None)  # compiles
-        whole = folder / "whole"
-        seconds = _train(whole, size, folder, None)
-        expected = (whole / MODEL_FILE).read_bytes()
-        rows: list[dict[str, float]] = []
-        while sum(row["kills"] for row in rows) < size.kills:
-            left = size.kills - sum(int(row["kills"]) for row in rows)
-            own = folder / str(len(rows))
-            rows.append(_one_folder(own, size, folder, seconds, left, rng))
-            rows[-1]["equal"] = float((own / MODEL_FILE).read_bytes() == expected)
-            yield Measurement("kill", f"folder {len(rows)}", rows[-1], {"seed": options.seed})
-        total = {name: sum(row[name] for row in rows) for name in rows[0]}
-        total |= {"folders": len(rows), "uninterrupted_seconds": seconds, "equal": min(row["equal"] for row in rows)}
-        yield Measurement("kill", "all", total, {"seed": options.seed})
+    """One row for each folder, and one for all."""
+    for name, case in CASES.items():
+        if not options.wants(name) or (options.quick and not case.to_model):
+            continue
+        kills = 2 if options.quick else case.kills
+        with tempfile.TemporaryDirectory() as place:
+            yield from _measure(name, case, kills, pathlib.Path(place), options.seed)
+
+
+def _measure(name: str, case: Case, kills: int, place: pathlib.Path, seed: int) -> Iterator[Measurement]:
+    rng, params = np.random.default_rng(seed), {"seed": seed}
+    _train(place / "compiles", case, None)
+    started = time.perf_counter()
+    _train(place / "whole", case, None)
+    seconds = time.perf_counter() - started
+    expected = (place / "whole" / MODEL_FILE).read_bytes()
+    rows: list[dict[str, float]] = []
+    while sum(row["kills"] for row in rows) < kills:
+        folder, left = place / str(len(rows)), kills - sum(row["kills"] for row in rows)
+        row = _one_folder(folder, case, seconds, left, rng)
+        rows.append({**row, "bytes_equal": float((folder / MODEL_FILE).read_bytes() == expected)})
+        yield Measurement(name, f"folder {len(rows)}", rows[-1], params)
+    total = {key: sum(row[key] for row in rows) for key in rows[0]}
+    total |= {"folders": len(rows), "folders_equal": total.pop("bytes_equal"), "uninterrupted_seconds": seconds}
+    yield Measurement(name, "all", total, params)
 
 
 def _one_folder(
-    folder: pathlib.Path, size: Size, place: pathlib.Path, seconds: float, max_kills: int, rng: np.random.Generator
+    folder: pathlib.Path, case: Case, seconds: float, max_kills: float, rng: np.random.Generator
 ) -> dict[str, float]:
     """Runs until the training has come through; what happened on the way."""
-    kills, frames_twice, parts_twice, left_behind = 0, 0, 0, 0
+    kills, twice = 0, {FRAMES: 0, PARTS: 0}
     before: dict[str, dict[pathlib.Path, int]] = {FRAMES: {}, PARTS: {}}
     started = time.perf_counter()
     while True:
-        limit = rng.uniform(0.0, seconds) if kills < max_kills else None
-        killed = _train(folder, size, place, limit) is None
-        after = {pattern: _written(folder, pattern) for pattern in before}
-        frames_twice += _again(before[FRAMES], after[FRAMES])
-        parts_twice += _again(before[PARTS], after[PARTS])
-        before = after
-        if not killed:
+        done = _train(folder, case, rng.uniform(0.0, seconds) if kills < max_kills else None)
+        for pattern, written in before.items():
+            now = _written(folder, pattern)
+            twice[pattern] += sum(path in now and now[path] != when for path, when in written.items())
+            before[pattern] = now
+        if done:
             break
         kills += 1
-    left_behind = len([file for file in folder.rglob(".*") if file.is_file()]) + len(list(folder.rglob("*.partial")))
     return {
         "kills": kills,
-        "frames_twice": frames_twice,
-        "parts_twice": parts_twice,
-        "files_left_behind": left_behind,
+        "frames_twice": twice[FRAMES],
+        "parts_twice": twice[PARTS],
         "seconds": time.perf_counter() - started,
     }
 
 
-def _train(folder: pathlib.Path, size: Size, place: pathlib.Path, limit: float | None) -> float | None:
-    """Seconds of a training; None if it was killed because it took longer than `limit`."""
-    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(place / "cache"), "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "fitting", *TRAIN, *size.options, "-o", str(folder)]
-    started = time.perf_counter()
-    try:
-        # On a timeout, `run` kills the process.
-        subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit, check=True)
-    except subprocess.TimeoutExpired:
-        return None
-    except subprocess.CalledProcessError as error:
-        raise RuntimeError(f"the training failed: {error.stderr.strip().splitlines()[-1]}") from error
-    return time.perf_counter() - started
+def _train(folder: pathlib.Path, case: Case, limit: float | None) -> bool:
+    """Whether the training came as far as it should; if not, it was killed after `limit` seconds."""
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder.parent / "cache"), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "fitting", *TRAIN, *case.options, "-o", str(folder)]
+    deadline = time.perf_counter() + (limit if limit is not None else float("inf"))
+    with tempfile.TemporaryFile("w+") as err:
+        process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=err)
+        while process.poll() is None and time.perf_counter() < deadline and not (folder / case.last_file).is_file():
+            time.sleep(0.005)
+        status = process.poll()
+        process.kill()
+        process.wait()
+        if status not in (None, 0):
+            err.seek(0)
+            raise RuntimeError(f"the training failed: {err.read().strip().splitlines()[-1]}")
+    return (folder / case.last_file).is_file()
 
 
 def _written(folder: pathlib.Path, pattern: str) -> dict[pathlib.Path, int]:
+    """Whole files and when they were written."""
     return {path: path.stat().st_mtime_ns for path in folder.glob(pattern) if not path.name.startswith(".")}
-
-
-def _again(before: dict[pathlib.Path, int], after: dict[pathlib.Path, int]) -> int:
-    return sum(path in after and after[path] != written for path, written in before.items())
