@@ -1,9 +1,9 @@
 """What the path tracer's own pictures are worth: three cases of the suite `pathtrace`, at 512 x 384.
 
 - `quality`: indirect light of 1, 4, 16 and 64 paths, filtered in all the ways of `denoising`, judged as there, against
-  1024 paths. The ambient occlusion that guides is the renderer's own: of the paths' first hits, with eight short rays
+  2048 paths. The ambient occlusion that guides is the renderer's own: of the paths' first hits, with eight short rays
   below 4 samples. `contact_mse_255` is of pixels where half the rays to a fiftieth of the scene's extent are blocked.
-- `final`: the whole picture of 1, 4 and 16 samples with direct light plain and by ratio, against 1024 anti-aliased
+- `final`: the whole picture of 1, 4 and 16 samples with direct light plain and by ratio, against 2048 anti-aliased
   samples: `mse_255_direct`, `mse_255_indirect` and `mse_255` of all, on 0..255 display-encoded, without the noise of
   the reference; means over two seeds.
 - `figures`: the paper's figures 2, 5, 6, 7 and 8 from these images, in `out/pathtrace`.
@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 
 from benchmarks import denoising
 from benchmarks.denoising import OURS, WAYS, Cell, load_cell, shown, worst_place
-from benchmarks.path_renders import FOLDER, PARTS, load_path_renders, load_smooth_reference, open_stage
+from benchmarks.path_renders import FOLDER, PARTS, load_path_renders, load_smooth_halves, open_stage
 from benchmarks.renders import SEEDS
 from benchmarks.suites import Measurement, Options
 from jaxrender.filters.aovs import Aovs
@@ -31,7 +31,7 @@ from jaxrender.pathtrace import Rendered, TraceSettings, render
 
 Color = Float[np.ndarray, "h w 3"]
 
-FULL = denoising.Sizes(pictures=())
+FULL = denoising.Sizes(reference_spp=2048, pictures=())
 QUICK = denoising.Sizes(height=48, width=64, scenes=("cornell",), spp=(1,), reference_spp=32, rounds=0, pictures=())
 #: Differences of 1 / GAIN of full scale have the brightest color.
 GAIN = 10.0
@@ -71,8 +71,7 @@ class _Truth:
     """An anti-aliased reference, and how far pictures are from it."""
 
     def __init__(self, scene: str, sizes: denoising.Sizes):
-        found = load_smooth_reference(scene, height=sizes.height, width=sizes.width, spp=sizes.reference_spp)
-        self._halves = [{name: found[f"{name}_{half}"] for name in PARTS} for half in "ab"]
+        self._halves = load_smooth_halves(scene, height=sizes.height, width=sizes.width, spp=sizes.reference_spp)
         for half in self._halves:
             half["image"] = sum((half[name] for name in PARTS), np.zeros_like(half["direct"]))
 

@@ -5,10 +5,12 @@ A file <scene>_<width>x<height>_<what>.npz holds images in linear float32:
 - noisy_<spp>_<seed>: guide rays as `trace_guides` gives them at its defaults, light over the reflectance. `ao` is the
   ambient occlusion that the renderer filters by: of the paths' own first hits, with eight short rays below 4 samples.
 - ao_64: the same of 64 rays of their own, for rivals and for the mask of contacts.
-- reference_<spp>: through pixel centres, with the variance of the mean of indirect light.
-- smooth_<spp>: what an anti-aliased picture converges to, twice (`_a`, `_b`), of half the paths each, so that their
-  difference tells the noise. 16 rays a pixel on a grid, each a guide ray of its own, share the paths; nothing is looked
-  up or filtered.
+- reference_<spp>_<seed>: through pixel centres. Two of them make a reference.
+- smooth_<spp>_<seed>: what an anti-aliased picture converges to. 16 rays a pixel on a grid, each a guide ray of its own,
+  share the paths; nothing is looked up or filtered. Two of them make a reference.
+
+The noise of a reference is told by the difference of its halves: paths of a low-discrepancy sequence are less noisy than
+their spread says.
 
 Surfaces are matt, indirect light has two bounces. Another seed is taken for references.
 """
@@ -28,7 +30,7 @@ from jaxrender.pathtrace import TraceSettings, World, prepare
 from jaxrender.pathtrace.guide_rays import AO_RADII, Traced, trace_guides
 
 FOLDER = Path("out") / "pathtrace"
-REFERENCE_SEED = 977
+REFERENCE_SEEDS = (977, 978)
 
 #: What a picture is the sum of.
 PARTS = ("direct", "indirect", "emission")
@@ -54,7 +56,7 @@ def load_path_renders(scene: str, *, height: int, width: int, spp: int, seed: in
     over = np.maximum(guides.albedo, 1e-3)
 
     def make_occlusion() -> Layers:
-        found = _trace(scene, height, width, TraceSettings(bounces=0, ao_rays=_AO_RAYS, seed=REFERENCE_SEED))
+        found = _trace(scene, height, width, TraceSettings(bounces=0, ao_rays=_AO_RAYS, seed=REFERENCE_SEEDS[0]))
         return {"ao": found.ao}
 
     ao = _kept(f"{scene}_{width}x{height}_ao_{_AO_RAYS}", make_occlusion)["ao"]
@@ -80,29 +82,34 @@ def load_guides(scene: str, *, height: int, width: int, spp: int, seed: int) -> 
 
 
 def load_reference(scene: str, *, height: int, width: int, spp: int) -> Layers:
-    """`direct`, `incident` and its `variance`, through pixel centres."""
+    """`direct`, `incident` and its `variance`, through pixel centres, of so many samples in two halves."""
+    halves = []
+    for seed in REFERENCE_SEEDS:
 
-    def make() -> Layers:
-        console.announce(f"pathtrace: {scene}, reference of {spp} samples")
-        found = _trace(scene, height, width, _converged(spp))
-        return {name: getattr(found, name) for name in ("direct", "incident", "variance")}
+        def make(seed: int = seed) -> Layers:
+            console.announce(f"pathtrace: {scene}, {spp // 2} samples of the reference")
+            found = _trace(scene, height, width, _converged(spp // 2, seed))
+            return {name: getattr(found, name) for name in ("direct", "incident")}
 
-    return _kept(f"{scene}_{width}x{height}_reference_{spp}", make)
+        halves.append(_kept(f"{scene}_{width}x{height}_reference_{spp // 2}_{seed}", make))
+    a, b = halves
+    means = {name: 0.5 * (a[name] + b[name]) for name in ("direct", "incident")}
+    return means | {"variance": 0.25 * (a["incident"] - b["incident"]) ** 2}
 
 
-def load_smooth_reference(scene: str, *, height: int, width: int, spp: int) -> Layers:
-    """`direct`, `indirect` and `emission`, means over whole pixels, each of two halves: `direct_a`, `direct_b`, ..."""
+def load_smooth_halves(scene: str, *, height: int, width: int, spp: int) -> list[Layers]:
+    """Two of `direct`, `indirect` and `emission`, means over whole pixels, together of so many samples."""
+    paths = max(1, spp // (2 * _GRID**2))
+    halves = []
+    for seed in REFERENCE_SEEDS:
 
-    def make() -> Layers:
-        console.announce(f"pathtrace: {scene}, anti-aliased reference of {spp} samples")
-        settings = _converged(max(1, spp // (2 * _GRID**2)))
-        made: Layers = {}
-        for half, seed in (("a", REFERENCE_SEED), ("b", REFERENCE_SEED + 1)):
-            found = _trace(scene, _GRID * height, _GRID * width, replace(settings, seed=seed))
-            made |= {f"{name}_{half}": _pixel_means(getattr(found, name)) for name in PARTS}
-        return made
+        def make(seed: int = seed) -> Layers:
+            console.announce(f"pathtrace: {scene}, {spp // 2} samples of the anti-aliased reference")
+            found = _trace(scene, _GRID * height, _GRID * width, _converged(paths, seed))
+            return {name: _pixel_means(getattr(found, name)) for name in PARTS}
 
-    return _kept(f"{scene}_{width}x{height}_smooth_{spp}", make)
+        halves.append(_kept(f"{scene}_{width}x{height}_smooth_{spp // 2}_{seed}", make))
+    return halves
 
 
 def _trace(scene: str, height: int, width: int, settings: TraceSettings) -> Traced:
@@ -111,8 +118,8 @@ def _trace(scene: str, height: int, width: int, settings: TraceSettings) -> Trac
     return trace_guides(world, stage.camera, height=height, width=width, settings=settings)
 
 
-def _converged(spp: int) -> TraceSettings:
-    return TraceSettings(samples_per_pixel=spp, ao_rays=0, direct="ratio", seed=REFERENCE_SEED)
+def _converged(spp: int, seed: int) -> TraceSettings:
+    return TraceSettings(samples_per_pixel=spp, ao_rays=0, direct="ratio", seed=seed)
 
 
 def _pixel_means(image: Image) -> Image:

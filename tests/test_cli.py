@@ -93,8 +93,9 @@ def test_interrupt_says_what_was_kept(capsys):
 
 def test_interrupt_of_a_real_process():
     code = """
-import time
+import signal, time
 from jaxrender import console
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which is off in a job that runs in the background
 def main():
     with console.keeping("kept"):
         print("ready", flush=True)

@@ -64,7 +64,7 @@ def test_pictures_are_there(made):
 @pytest.mark.data
 def test_renders_are_kept(made, monkeypatch):
     _, folder = made
-    assert {"cornell_64x48_noisy_1_0.npz", "cornell_64x48_reference_32.npz", "cornell_64x48_smooth_32.npz"} <= {
+    assert {"cornell_64x48_noisy_1_0.npz", "cornell_64x48_reference_16_977.npz", "cornell_64x48_smooth_16_978.npz"} <= {
         file.name for file in folder.iterdir()
     }
     monkeypatch.setattr(path_renders, "FOLDER", folder)
