@@ -6,11 +6,11 @@ A file <scene>_<width>x<height>_<what>.npz holds images in linear float32:
   ambient occlusion that the renderer filters by: of the paths' own first hits, with eight short rays below 4 samples.
 - ao_64: the same of 64 rays of their own, for rivals and for the mask of contacts.
 - reference_<spp>_<seed>: through pixel centres. Two of them make a reference.
-- smooth_<spp>_<seed>: what an anti-aliased picture converges to. 16 rays a pixel on a grid, each a guide ray of its own,
-  share the paths; nothing is looked up or filtered. Two of them make a reference.
+- smooth_<spp>_<seed>: what an anti-aliased picture converges to. 16 rays a pixel on a grid, each a guide ray of its
+  own, share the paths; nothing is looked up or filtered. Two of them make a reference.
 
-The noise of a reference is told by the difference of its halves: paths of a low-discrepancy sequence are less noisy than
-their spread says.
+The noise of a reference is told by the difference of its halves: paths of a low-discrepancy sequence are less noisy
+than their spread says.
 
 Surfaces are matt, indirect light has two bounces. Another seed is taken for references.
 """
