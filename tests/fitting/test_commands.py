@@ -46,7 +46,9 @@ def test_train_writes_what_it_says(run):
     assert re.search(r"pose components\D*>6<", page)
     _, header, _ = find_model(out)
     assert header["source"]["input"] == str((run / "character.glb").resolve())
-    assert header["errors"]["train"] < 0.3
+    assert header["errors"]["train"] < 0.3 and "seconds" not in header
+    assert {"bake", "evaluate", "pictures"} <= set(json.loads((out / "times.json").read_bytes())["seconds"])
+    assert not (out / "unfinished").exists() and not list(out.glob(".*"))
 
 
 def test_evaluate_measures_the_model_in_the_file(run, tmp_path, capsys):
@@ -54,8 +56,11 @@ def test_evaluate_measures_the_model_in_the_file(run, tmp_path, capsys):
     shutil.copytree(run / "out" / "run", tmp_path / "run")
     file = tmp_path / "run" / MODEL_FILE
     _, header, _ = find_model(file)
-    assert main(["evaluate", str(tmp_path / "run"), "--no-study", "--json"]) == 0
+    before = {path: path.stat().st_mtime_ns for path in file.parent.rglob("*")}
+    assert main(["evaluate", str(tmp_path / "run"), "-o", str(tmp_path / "again"), "--no-study", "--json"]) == 0
     assert printed(capsys)["errors"]["train"] == pytest.approx(header["errors"]["train"], rel=1e-4)
+    assert (tmp_path / "again" / "report.html").is_file()
+    assert before == {path: path.stat().st_mtime_ns for path in file.parent.rglob("*")}
     arrays = load_file(file)
     arrays["weights"][:] = 0.0
     arrays["offset"][:] = 0.0
