@@ -1,8 +1,9 @@
 """Training killed at random moments: what is done twice, and whether the model is the uninterrupted one, bit by bit.
 
-A small training runs as a process and is killed (SIGKILL) after a time drawn evenly from that of an uninterrupted one,
-again and again until one comes through; then the next folder begins. A frame of the bake or a part that was whole on
-disk and is written again counts as done twice.
+A small training runs as a process and is killed (SIGKILL) up to 0.3 seconds after it has written some file, both
+drawn evenly from what is left to do, again and again until it comes through; then the next folder begins. So kills
+fall as often into the work on a busy machine as on a free one. A frame of the bake or a part that was whole on disk and
+is written again counts as done twice.
 """
 
 import os
@@ -63,31 +64,30 @@ def run(options: Options) -> Iterator[Measurement]:
 
 def _measure(name: str, case: Case, kills: int, place: pathlib.Path, seed: int) -> Iterator[Measurement]:
     rng, params = np.random.default_rng(seed), {"seed": seed}
-    _train(place / "compiles", case, None)
-    started = time.perf_counter()
     _train(place / "whole", case, None)
-    seconds = time.perf_counter() - started
+    num_files = len(_files(place / "whole"))
     expected = (place / "whole" / MODEL_FILE).read_bytes()
     rows: list[dict[str, float]] = []
     while sum(row["kills"] for row in rows) < kills:
         folder, left = place / str(len(rows)), kills - sum(row["kills"] for row in rows)
-        row = _one_folder(folder, case, seconds, left, rng)
+        row = _one_folder(folder, case, num_files, left, rng)
         rows.append({**row, "bytes_equal": float((folder / MODEL_FILE).read_bytes() == expected)})
         yield Measurement(name, f"folder {len(rows)}", rows[-1], params)
     total = {key: sum(row[key] for row in rows) for key in rows[0]}
-    total |= {"folders": len(rows), "folders_equal": total.pop("bytes_equal"), "uninterrupted_seconds": seconds}
+    total |= {"folders": len(rows), "folders_equal": total.pop("bytes_equal"), "files": num_files}
     yield Measurement(name, "all", total, params)
 
 
 def _one_folder(
-    folder: pathlib.Path, case: Case, seconds: float, max_kills: float, rng: np.random.Generator
+    folder: pathlib.Path, case: Case, num_files: int, max_kills: float, rng: np.random.Generator
 ) -> dict[str, float]:
     """Runs until the training has come through; what happened on the way."""
     kills, twice = 0, {FRAMES: 0, PARTS: 0}
     before: dict[str, dict[pathlib.Path, int]] = {FRAMES: {}, PARTS: {}}
     started = time.perf_counter()
     while True:
-        done = _train(folder, case, rng.uniform(0.0, seconds) if kills < max_kills else None)
+        after = int(rng.integers(len(_files(folder)), num_files + 1)), rng.uniform(0.0, 0.3)
+        done = _train(folder, case, after if kills < max_kills else None)
         for pattern, written in before.items():
             now = _written(folder, pattern)
             twice[pattern] += sum(path in now and now[path] != when for path, when in written.items())
@@ -103,15 +103,18 @@ def _one_folder(
     }
 
 
-def _train(folder: pathlib.Path, case: Case, limit: float | None) -> bool:
-    """Whether the training came as far as it should; if not, it was killed after `limit` seconds."""
+def _train(folder: pathlib.Path, case: Case, after: tuple[int, float] | None) -> bool:
+    """Whether the training came as far as it should; if not, it was killed `after` some files and seconds."""
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder.parent / "cache"), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "fitting", *TRAIN, *case.options, "-o", str(folder)]
-    deadline = time.perf_counter() + (limit if limit is not None else float("inf"))
+    num_files, seconds = after or (0, 0.0)
+    deadline = float("inf")
     with tempfile.TemporaryFile("w+") as err:
         process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=err)
         while process.poll() is None and time.perf_counter() < deadline and not (folder / case.last_file).is_file():
-            time.sleep(0.005)
+            if after and deadline == float("inf") and len(_files(folder)) >= num_files:
+                deadline = time.perf_counter() + seconds
+            time.sleep(0.002)
         status = process.poll()
         process.kill()
         process.wait()
@@ -119,6 +122,10 @@ def _train(folder: pathlib.Path, case: Case, limit: float | None) -> bool:
             err.seek(0)
             raise RuntimeError(f"the training failed: {err.read().strip().splitlines()[-1]}")
     return (folder / case.last_file).is_file()
+
+
+def _files(folder: pathlib.Path) -> list[pathlib.Path]:
+    return [path for pattern in (FRAMES, PARTS) for path in folder.glob(pattern)]
 
 
 def _written(folder: pathlib.Path, pattern: str) -> dict[pathlib.Path, int]:
