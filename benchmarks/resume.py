@@ -111,13 +111,15 @@ def _train(folder: pathlib.Path, case: Case, after: tuple[int, float] | None) ->
     deadline = float("inf")
     with tempfile.TemporaryFile("w+") as err:
         process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=err)
-        while process.poll() is None and time.perf_counter() < deadline and not (folder / case.last_file).is_file():
-            if after and deadline == float("inf") and len(_files(folder)) >= num_files:
-                deadline = time.perf_counter() + seconds
-            time.sleep(0.002)
-        status = process.poll()
-        process.kill()
-        process.wait()
+        try:
+            while process.poll() is None and time.perf_counter() < deadline and not (folder / case.last_file).is_file():
+                if after and deadline == float("inf") and len(_files(folder)) >= num_files:
+                    deadline = time.perf_counter() + seconds
+                time.sleep(0.002)
+            status = process.poll()
+        finally:
+            process.kill()
+            process.wait()
         if status not in (None, 0):
             err.seek(0)
             raise RuntimeError(f"the training failed: {err.read().strip().splitlines()[-1]}")
