@@ -6,7 +6,7 @@ import stat
 
 import pytest
 
-from jaxrender.io.atomic import atomic_path, write_bytes
+from jaxrender.io.atomic import atomic_path, remove_leftovers, write_bytes
 
 
 def test_writes_and_makes_folders(tmp_path):
@@ -36,6 +36,14 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing(tmp_path, error):
 def test_the_temporary_file_keeps_the_ending(tmp_path):
     with atomic_path(tmp_path / "picture.png") as temporary:
         assert temporary.suffix == ".png" and temporary.parent == tmp_path
+
+
+def test_leftovers_of_killed_processes_are_removed_and_nothing_else(tmp_path):
+    kept = ["model.bin", ".model.bin", ".model.0123abcd.txt", ".model.0123abc.bin", ".other.0123abcd.bin"]
+    for name in [*kept, ".model.0123abcd.bin", ".model.ffffffff.bin"]:
+        (tmp_path / name).touch()
+    remove_leftovers(tmp_path / "model.bin")
+    assert sorted(os.listdir(tmp_path)) == sorted(kept)
 
 
 def test_a_folder_is_refused(tmp_path):
