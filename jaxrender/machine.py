@@ -48,7 +48,7 @@ def check_memory(what: str, needed: int) -> None:
     """Raises MemoryError, with how much is there, unless so many bytes can be had for `what`."""
     free = available_memory()
     if free is not None and needed > free:
-        raise MemoryError(f"for {what}: about {needed / 1e9:.1f} GB needed, {free / 1e9:.1f} GB available")
+        raise MemoryError(f"{what}: about {needed / 1e9:.1f} GB needed, {free / 1e9:.1f} GB available")
 
 
 def keep_xla_to_one_thread() -> None:

@@ -30,5 +30,5 @@ def test_memory_is_the_smaller_of_machine_and_group(tmp_path, monkeypatch):
         assert found == expected if expected is not None else (found is None) == (machine_alone is None)
     monkeypatch.setattr(machine, "available_memory", lambda: 2_000_000_000)
     machine.check_memory("a picture", 2_000_000_000)
-    with pytest.raises(MemoryError, match=r"for a picture: about 3\.5 GB needed, 2\.0 GB available"):
+    with pytest.raises(MemoryError, match=r"a picture: about 3\.5 GB needed, 2\.0 GB available"):
         machine.check_memory("a picture", 3_500_000_000)

@@ -120,7 +120,7 @@ def test_what_is_too_large_or_not_light_is_one_line(folder, capsys, monkeypatch)
     monkeypatch.setattr("jaxrender.machine.available_memory", lambda: 10**6)
     assert cli.main(["trace", *SMALL]) == 2
     (line,) = [text for text in capsys.readouterr().err.splitlines() if text.startswith("jaxrender: error")]
-    assert "not enough memory for 11794 triangles: about" in line and line.endswith("GB available")
+    assert "not enough memory: 11794 triangles: about" in line and line.endswith("GB available")
 
 
 @pytest.mark.parametrize(
