@@ -246,8 +246,8 @@ def search(error: Callable[[Settings], float], start: Settings, *, rounds: int) 
         before = dict(best)
         for name in start:
             for step in STEPS.get(name, _USUAL_STEPS):
-                # A step that gains less than this is not worth the next one.
-                while tried(moved := {**best, name: step(best[name])}) < 0.999 * tried(best):
+                # A step that gains less than this is not worth the next one. Errors may be below 0.
+                while tried(moved := {**best, name: step(best[name])}) < tried(best) - 1e-3 * abs(tried(best)):
                     best = moved
         if best == before:
             break

@@ -144,6 +144,12 @@ def test_search_ends_at_bounds():
     assert best == {"levels": 1, "sigma": 0.5}
 
 
+def test_search_ends_where_nothing_changes_below_0():
+    """Where noise of the reference is taken away, errors may be negative: standing still is no gain."""
+    best, least = denoising.search(lambda settings: -0.1, {"levels": 3, "normal": 0.2}, rounds=2)
+    assert best == {"levels": 3, "normal": 0.2} and least == -0.1
+
+
 def test_search_does_not_run_after_nan():
     start = {"sigma": 2.0}
     assert denoising.search(lambda settings: math.nan, start, rounds=3)[0] == start
