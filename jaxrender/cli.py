@@ -231,6 +231,8 @@ class Trace(SceneView):
     """Of the filter, in pixels. By default a rule in samples and resolution."""
     eps: float | None = None
     """Of the filter: factor on what tells edges from noise. By default a rule."""
+    auto: bool | None = None
+    """Find radius and eps by cross-validation. By default from 16 samples on, but not with --frames."""
     direct: Literal["auto", "ratio", "plain"] = "auto"
     """Soft shadows: unshadowed light times a filtered ratio, or plain samples. By default the ratio up to 31 rays."""
     model: Literal["metallic_roughness", "phong", "lambert"] = "metallic_roughness"

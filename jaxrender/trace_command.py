@@ -61,6 +61,8 @@ def _settings(options: "Trace", *, spp: int, seed: int) -> TraceSettings:
         bounces=options.bounces, samples_per_pixel=spp, light_samples=options.light_samples, model=options.model,
         method=options.filter, radius=options.radius, eps=options.eps, seed=seed,
         direct=None if options.direct == "auto" else options.direct,
+        # From frame to frame the filter should not change.
+        auto=False if options.auto is None and options.frames > 1 else options.auto,
     )  # fmt: skip
 
 

@@ -108,7 +108,7 @@ def filter_incident(guides: Traced, settings: TraceSettings) -> tuple[np.ndarray
     )  # fmt: skip
     chosen = DenoiseSettings(
         method=settings.method, radius=settings.radius, eps=settings.eps,  # type: ignore[arg-type]
-        samples_per_pixel=settings.samples_per_pixel,
+        samples_per_pixel=settings.samples_per_pixel, auto=settings.cross_validated,
     )  # fmt: skip
     found = denoise(aovs, settings=chosen)
     light, largest = found.layers["indirect"], int(found.chosen["radius"])

@@ -10,6 +10,10 @@ METHODS = ("guided", "bilateral", "atrous", "none")
 #: From so many shadow rays a pixel on, their mean is better than a filtered ratio.
 PLAIN_FROM = 32
 
+#: From so many samples on, radius and eps of the filter are found by cross-validation. The rule is made for independent
+#: samples; ours are stratified, so that from here on their noise is less than it takes for granted.
+AUTO_FROM = 16
+
 #: Most bounces that may be asked for.
 MOST_BOUNCES = 64
 
@@ -25,7 +29,8 @@ class TraceSettings:
       light_samples: of area lights and surroundings each, for each eye ray.
       model: reflection, one of `scatter.MODELS`.
       method: the filter of the indirect light, "guided", "bilateral", "atrous" or "none".
-      radius, eps: of the filter, as in `DenoiseSettings`; None goes by its rule.
+      radius, eps: of the filter, as in `DenoiseSettings`; None goes by its rule, or by cross-validation.
+      auto: whether by cross-validation; None is from `AUTO_FROM` samples on.
       ao_rays: rays of ambient occlusion per pixel, a guide of the filter; None is 8 below 4 samples, else 0, where the
         paths' own first hits are enough.
       direct: how noise of soft shadows is met. "plain" averages samples; "ratio" multiplies unshadowed light by a
@@ -40,6 +45,7 @@ class TraceSettings:
     method: str = "guided"
     radius: int | None = None
     eps: float | None = None
+    auto: bool | None = None
     ao_rays: int | None = None
     direct: str | None = None
     seed: int = 0
@@ -57,6 +63,11 @@ class TraceSettings:
             checks.check_one_of("direct", self.direct, ("plain", "ratio"))
         if self.ao_rays is not None:
             checks.check_at_least("ao_rays", self.ao_rays, 0)
+
+    @property
+    def cross_validated(self) -> bool:
+        """Whether the filter's radius and eps, as far as they are None, are found by cross-validation."""
+        return self.samples_per_pixel >= AUTO_FROM if self.auto is None else self.auto
 
     @property
     def by_ratio(self) -> bool:

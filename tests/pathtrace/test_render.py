@@ -235,6 +235,19 @@ def test_reflections_in_metal_survive_the_filter():
     np.testing.assert_array_equal(*given)
 
 
+def test_the_filter_is_cross_validated_from_16_samples_on():
+    """And where it is asked for; what is set stays."""
+    world = prepare(room(floor(), sphere(matt((0.7, 0.3, 0.2)), radius=0.5)), environment=WHITE)
+    settings = TraceSettings(samples_per_pixel=2, bounces=1, ao_rays=0, model="lambert")
+    guides = trace_guides(world, ABOVE, settings=settings, **SIZE)
+
+    def told(**changed):
+        return filter_incident(guides, dataclasses.replace(settings, **changed))[1]["how"]
+
+    assert [told(), told(auto=True), told(auto=False, samples_per_pixel=16)] == ["rule", "cross-validation", "rule"]
+    assert told(samples_per_pixel=16) == "cross-validation" and told(radius=2, eps=1.0, auto=True) == "given"
+
+
 def test_holes_let_light_through():
     """A masked plate with a hole: eye rays, shadow rays and bounces pass it."""
     texels = np.full((16, 16, 4), 255, np.uint8)
