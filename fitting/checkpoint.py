@@ -177,7 +177,9 @@ class Stage:
     def remove_foreign(self) -> None:
         """Removes parts of something else: disk use stays that of one run."""
         foreign = 0
-        for path in (self.checkpoint.folder or Path()).glob(f"{self.name}/*.part"):
+        if self.checkpoint.folder is None:
+            return
+        for path in self.checkpoint.folder.glob(f"{self.name}/*.part"):
             head = self._head(path.stem)
             with path.open("rb") as file:
                 if file.read(len(head)) == head:

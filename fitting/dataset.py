@@ -151,7 +151,9 @@ class VisibilityStore:
         if not path.exists():
             with only_writer(path.parent):
                 _remove_unfinished(path)
-                _create(path, shape, {**contents, "run": to_jsonable(run or {})})
+                # Another run may have made it while this one waited.
+                if not path.exists():
+                    _create(path, shape, {**contents, "run": to_jsonable(run or {})})
         _refuse_another(path, contents, to_jsonable(run or {}))
         try:
             self._visibility = zarr.open_array(path / "visibility", mode="r+")

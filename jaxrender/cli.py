@@ -285,6 +285,8 @@ class Trace(SceneView):
         for name, number in (("time", self.time), ("eps", self.eps)):
             if number is not None and not 0.0 < number < math.inf:
                 raise ValueError(f"--{name}: expected a finite number above 0, got {number}")
+        if not 0 <= self.seed < 2**31 - self.frames:
+            raise ValueError(f"--seed: expected a number from 0 to {2**31 - 1}, less the frames, got {self.seed}")
         if self.bounces > 64:
             raise ValueError(f"--bounces: expected at most 64, got {self.bounces}")
         if self.time is not None and self.frames > 1:

@@ -74,7 +74,7 @@ def _still(options: "Trace", world: World, camera: Camera, out: Path) -> tuple[l
     picture = render(world, camera, height=height, width=width, settings=settings)
     seconds = time.perf_counter() - started
     console.announce(_told(picture, options.spp))
-    return _write(picture, out, options), {"spp": options.spp, "seconds": seconds, **picture.chosen}
+    return _write(picture, out, options, spp=options.spp), {"spp": options.spp, "seconds": seconds, **picture.chosen}
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def _frames(options: "Trace", first: World, film: Film, out: Path) -> tuple[list
     paths: list[Path] = []
     seconds, flickers, shares = [], [], []
     before: _Shot | None = None
-    name = numbered_name(str(out))
+    name = numbered_name(out.name)
     for frame in console.track(range(options.frames), "frames", total=options.frames):
         with console.keeping(f"{frame} of {options.frames} frames are finished and stay"):
             started = time.perf_counter()
@@ -102,7 +102,7 @@ def _frames(options: "Trace", first: World, film: Film, out: Path) -> tuple[list
             camera = film.view(frame, scene)
             picture = render(world, camera, height=height, width=width, settings=settings)
             seconds.append(time.perf_counter() - started)
-            paths += _write(picture, Path(frame_name(name, frame + 1)), options)
+            paths += _write(picture, out.with_name(frame_name(name, frame + 1)), options, spp=options.spp)
             now = _Shot(scene, camera, picture)
             if before is not None:
                 found, share = _flicker(world, before, now, stops=options.exposure_stops)
@@ -110,7 +110,9 @@ def _frames(options: "Trace", first: World, film: Film, out: Path) -> tuple[list
                 shares.append(share)
             before = now
     console.announce(_told(picture, options.spp))
-    mean, share = float(np.mean(flickers)), float(np.mean(shares))
+    # A pair of frames that share nothing tells nothing.
+    share = float(np.mean(shares))
+    mean = float(np.average(flickers, weights=shares)) if share else 0.0
     console.announce(f"flicker {mean:.2f} of 255 from frame to frame, on the {100.0 * share:.0f} % seen in both")
     record = {"spp": options.spp, "seconds": seconds, "flicker_rms_255": flickers, "seen_in_both": shares}
     return paths, {**record, **({"clip": film.clip.name} if film.clip else {}), **picture.chosen}
@@ -142,7 +144,7 @@ def _progressive(options: "Trace", world: World, camera: Camera, out: Path) -> t
         settings = _settings(options, spp=spp, seed=options.seed)
         incident, chosen = filter_incident(guides, settings)
         picture = combine(world, camera, guides, incident, settings=settings, chosen=chosen)
-        paths = _write(picture, out, options)
+        paths = _write(picture, out, options, spp=spp)
         now = time.perf_counter()
         console.announce(f"{now - started:.1f} s: {_told(picture, spp)}")
         # The first turn compiles; later ones take about twice as long as the one before.
@@ -159,8 +161,8 @@ def _told(picture: Rendered, spp: int) -> str:
     return f"{spp} samples a pixel; {chosen['method']} filter, radius {chosen['radius']} ({chosen['how']})"
 
 
-def _write(picture: Rendered, out: Path, options: "Trace") -> list[Path]:
-    """The PNG, and the EXR files if they are asked for."""
+def _write(picture: Rendered, out: Path, options: "Trace", *, spp: int) -> list[Path]:
+    """The PNG, and the EXR files if they are asked for; the noisy one says of how many samples it is."""
     write_png(out, tone_map(picture.image, exposure_stops=options.exposure_stops))
     if not options.exr:
         return [out]
@@ -173,8 +175,8 @@ def _write(picture: Rendered, out: Path, options: "Trace") -> list[Path]:
         "variance": guides.variance, "half_a": guides.even, "half_b": guides.odd,
     }  # fmt: skip
     paths = [out.with_suffix(".exr"), out.with_suffix(".noisy.exr")]
-    for path, layers in zip(paths, (clean, noisy), strict=True):
-        write_exr(path, {**layers, **shared})
+    write_exr(paths[0], {**clean, **shared})
+    write_exr(paths[1], {**noisy, **shared}, attributes={"samplesPerPixel": spp})
     return [out, *paths]
 
 

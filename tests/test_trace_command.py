@@ -55,6 +55,18 @@ def test_frames_go_round_and_time_is_kept(folder, capsys):
     assert "1 samples a pixel" in err and (folder / "t.png").is_file()
 
 
+def test_numbers_go_into_the_name_of_the_file_alone(folder, capsys):
+    """Not into that of its folder; and a seed is checked before anything is built."""
+    frames = ["--frames", "1", *SMALL]
+    assert cli.main(["trace", "-o", "take#1/t.png", *frames]) == 0
+    assert [str(path.relative_to(folder)) for path in folder.glob("take*/*")] == ["take#1/t.png"]
+    assert cli.main(["trace", "-o", "take#1/u.png", "--frames", "2", "--new-seeds", *SMALL]) == 0
+    assert {path.name for path in folder.glob("take#1/u*")} == {"u.0001.png", "u.0002.png"}
+    capsys.readouterr()
+    assert cli.main(["trace", "--seed", "99999999999", *SMALL]) == 2
+    assert "--seed: expected a number from 0 to 2147483647" in capsys.readouterr().err
+
+
 def test_rays_by_the_tree(folder, capsys):
     """The same picture, and the command says who traces; no bounces and no filter, so that little is compiled."""
     plain = ["--size", "16", "12", "--spp", "1", "--bounces", "0", "--direct", "plain"]

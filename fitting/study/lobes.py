@@ -207,7 +207,7 @@ def subset_rows(
       refined: by number of lobes and offset.
       axes: of each point, by number of lobes.
     """
-    stage = checkpoint.stage("study_per_frame", ground.data, ground.linear, joint_angles)
+    stage = checkpoint.stage("study_per_frame", ground.data, ground.linear, joint_angles, axes)
     mean = np.broadcast_to(ground.sh[ground.train].mean(0), ground.sh.shape)
     rows = [
         method_row(ground, "mean visibility", 0, mean),

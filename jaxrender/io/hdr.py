@@ -86,7 +86,7 @@ def _check_radiance(path: pathlib.Path, image: np.ndarray, *, clean: bool) -> np
     if clean:
         return np.where(lost | negative, np.float32(0), image)
     if lost.any() or negative.any():
-        got = f"{lost.sum()} NaN or Inf and {(negative & ~lost).sum()} negative ones (clean sets them to 0)"
+        got = f"{lost.sum()} NaN or Inf and {(negative & ~lost).sum()} negative ones"
         checks.bad_input(path, "radiance", expected="finite values of at least 0", got=got)
     return image
 

@@ -167,7 +167,8 @@ def _indirect(
         terms["odd" if sample % 2 else "even"] = terms.pop("incident")
         sums = programs.added(sums, terms)
     for ray in range(settings.num_ao_rays):
-        rays = programs.occlusion_rays(at, seeds, np.int32(first_sample + ray))
+        number = first_sample * settings.num_ao_rays + ray
+        rays = programs.occlusion_rays(at, seeds, np.int32(number))
         hits = world.rays.closest(rays, path.alive, reach=float(radii.max()))
         sums = programs.added(sums, {"ao": Vec3(*programs.openness(hits.t, hits.triangle, radii))})
     counts = settings.samples_per_pixel, scattered + settings.num_ao_rays

@@ -44,7 +44,7 @@ ROULETTE_FROM = 3
 
 
 class Vertex(NamedTuple):
-    """What is done at a vertex; static, but for the number.
+    """What is done at a vertex; static, but for the number, and for how many are scattered where any are.
 
     Attributes:
       number: 0 is what the eye sees.
@@ -54,7 +54,7 @@ class Vertex(NamedTuple):
 
     number: int | Int[Array, ""]
     drawn: int
-    scattered: int
+    scattered: int | Float[Array, ""]
     model: str
 
 
@@ -149,7 +149,7 @@ def _pair(at: Reflector, index: Int[Array, ""], seeds: Words, dimension: int | A
 def _toward(at: Reflector, path: Path, light: Arriving, vertex: Vertex) -> ShadowRays:
     f = evaluate(at, light.wi, model=vertex.model)
     both = vertex.drawn * light.density
-    if vertex.scattered:
+    if isinstance(vertex.scattered, Array) or vertex.scattered:
         both = both + vertex.scattered * jnp.where(path.shared, density(at, light.wi, model=vertex.model), 0.0)
     weight = jnp.where(light.density > 0.0, light.density / jnp.maximum(both, 1e-30), 1.0 / vertex.drawn)
     arriving = vec3.where(path.alive, path.throughput * f * light.radiance * weight, 0.0)

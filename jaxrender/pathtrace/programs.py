@@ -137,8 +137,8 @@ def light_up(
     arrived = unshadowed = black(at)
     if not emitters.groups:
         return arrived, unshadowed
-    number, vertex = np.int32(vertex.number), vertex._replace(number=0)
-    for shadow in _draw_lights(emitters, world.table, at, path, seeds, np.int32(index), number, vertex=vertex):
+    numbers, vertex = _apart(vertex)
+    for shadow in _draw_lights(emitters, world.table, at, path, seeds, np.int32(index), numbers, vertex=vertex):
         arrived, unshadowed = _add_light(arrived, unshadowed, shadow.light, world.rays.blocked(shadow))
     return arrived, unshadowed
 
@@ -200,12 +200,17 @@ def arrive(path: Path, direction: Vec3, surface: HitSurface, *, model: str) -> t
     return make_reflector(surface, direction, model=model), path
 
 
-@functools.partial(jax.jit, static_argnames="vertex")
 def unshadowed_light(
-    emitters: Emitters, table: SurfaceTable, at: Reflector, path: Path, seeds: Array, index: Array, *, vertex: Vertex
+    emitters: Emitters, table: SurfaceTable, at: Reflector, path: Path, seeds: Array, index: int, *, vertex: Vertex
 ) -> Vec3:
     """The second result of `light_up` alone: no rays, and a program whose size does not grow with the number drawn."""
-    one = vertex._replace(drawn=1)
+    numbers, vertex = _apart(vertex)
+    return _unshadowed_light(emitters, table, at, path, seeds, np.int32(index), numbers, vertex=vertex)
+
+
+@functools.partial(jax.jit, static_argnames="vertex")
+def _unshadowed_light(emitters, table, at, path, seeds, index, numbers, *, vertex: Vertex) -> Vec3:
+    one = _whole(numbers, vertex)._replace(drawn=1)
 
     def add(s: Array, total: Vec3) -> Vec3:
         for ray in paths.draw_lights(emitters, table, at, path, seeds, index * vertex.drawn + s, vertex=one):
@@ -218,25 +223,42 @@ def unshadowed_light(
 
 def scatter(at: Reflector, path: Path, seeds: Array, index: int, *, vertex: Vertex) -> tuple[Rays, Path]:
     """`paths.go_on`: one program for all vertices."""
-    number, vertex = np.int32(vertex.number), vertex._replace(number=0)
-    return _go_on(at, path, seeds, np.int32(index), number, vertex=vertex)
+    numbers, vertex = _apart(vertex)
+    return _go_on(at, path, seeds, np.int32(index), numbers, vertex=vertex)
 
 
 @functools.partial(jax.jit, static_argnames="vertex")
-def _draw_lights(emitters, table, at, path, seeds, index, number, *, vertex: Vertex):
-    return paths.draw_lights(emitters, table, at, path, seeds, index, vertex=vertex._replace(number=number))
+def _draw_lights(emitters, table, at, path, seeds, index, numbers, *, vertex: Vertex):
+    return paths.draw_lights(emitters, table, at, path, seeds, index, vertex=_whole(numbers, vertex))
 
 
 @functools.partial(jax.jit, static_argnames="vertex")
-def _go_on(at, path, seeds, index, number, *, vertex: Vertex):
-    return paths.go_on(at, path, seeds, index, vertex=vertex._replace(number=number))
+def _go_on(at, path, seeds, index, numbers, *, vertex: Vertex):
+    return paths.go_on(at, path, seeds, index, vertex=_whole(numbers, vertex))
 
 
 def meet(
     emitters: Emitters, path: Path, direction: Vec3, distance: Array | np.ndarray, surface: HitSurface, *, left: Vertex
 ) -> Vec3:
     """`paths.meet`."""
-    return _meet(emitters, path, direction, distance, surface, left=left._replace(number=0))
+    numbers, left = _apart(left)
+    return _meet(emitters, path, direction, distance, surface, numbers, left=left)
+
+
+@functools.partial(jax.jit, static_argnames="left")
+def _meet(emitters, path, direction, distance, surface, numbers, *, left: Vertex) -> Vec3:
+    return paths.meet(emitters, path, direction, distance, surface, left=_whole(numbers, left))
+
+
+def _apart(vertex: Vertex) -> tuple[tuple[np.int32, np.float32], Vertex]:
+    """What of a vertex may change without another program, and the rest."""
+    numbers = np.int32(vertex.number), np.float32(vertex.scattered)
+    return numbers, vertex._replace(number=0, scattered=1 if vertex.scattered else 0)
+
+
+def _whole(numbers: tuple[Array, Array], vertex: Vertex) -> Vertex:
+    number, scattered = numbers
+    return vertex._replace(number=number, scattered=scattered if vertex.scattered else 0)
 
 
 @functools.partial(jax.jit, static_argnames="by_ratio")
@@ -277,7 +299,6 @@ def _side_by_side(images: Images) -> dict[str, Float[Array, "n c"]]:
     return {name: jnp.stack(channels, axis=-1) if len(channels) else none for name, channels in images.items()}
 
 
-_meet = jax.jit(paths.meet, static_argnames="left")
 openness = jax.jit(paths.openness)
 _gather = jax.jit(gather_corners)
 _texels = jax.jit(look_up_texels, static_argnames="fine")

@@ -19,6 +19,7 @@ from jaxrender import vec3
 from jaxrender.camera import Camera
 from jaxrender.filters.aovs import Aovs
 from jaxrender.filters.denoiser import denoise
+from jaxrender.filters.fireflies import clamp_fireflies
 from jaxrender.filters.settings import DenoiseSettings
 from jaxrender.pathtrace import programs
 from jaxrender.pathtrace.emitters import only
@@ -35,6 +36,8 @@ from jaxrender.vec3 import Scalar, Vec3
 #: Of a picture; they add up to it.
 PARTS = ("direct", "indirect", "emission")
 
+# As the filters do it.
+_FIREFLY_FACTOR = 16.0
 # Radii that are wanted this near below one are not worth another.
 _NEAR = 0.5
 
@@ -118,10 +121,10 @@ def filter_incident(guides: Traced, settings: TraceSettings) -> tuple[np.ndarray
         chosen = dataclasses.replace(chosen, eps=float(found.chosen["eps"]))
         narrower = [
             denoise(aovs, settings=dataclasses.replace(chosen, radius=radius)).layers["indirect"]
-            if radius else guides.incident for radius in radii[1:]
+            if radius else np.asarray(_clamped(guides.incident)) for radius in radii[1:]
         ]  # fmt: skip
         light = np.asarray(_blend(np.stack([light, *narrower]), np.asarray(radii, np.float32), wanted))
-    return light, found.chosen
+    return light, {name: value for name, value in found.chosen.items() if name != "filtered"}
 
 
 def combine(
@@ -184,16 +187,18 @@ def _block(
         at, path, seen = programs.see(world, view, rays, model=model, by_ratio=True)
         found = programs.look_up_guides(*images, camera, seen, height=height, width=width)
         light, _ = light_up(world, drawn, at, path, seeds, sample, vertex=vertex)
-        whole = [
-            unshadowed_light(emitters, world.table, at, path, seeds, np.int32(sample), vertex=many)
-            for emitters in by_ratio
-        ]
+        whole = [unshadowed_light(emitters, world.table, at, path, seeds, sample, vertex=many) for emitters in by_ratio]
         parts = _parts(seen, found, path.shared, light, whole)
         sums = programs.added(sums, parts) if sums else parts
     return sums
 
 
 _blend = jax.jit(blend_windows)
+
+
+@jax.jit
+def _clamped(light: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
+    return clamp_fireflies(light, factor=_FIREFLY_FACTOR)[0]
 
 
 @jax.jit

@@ -31,8 +31,8 @@ class TraceSettings:
       method: the filter of the indirect light, "guided", "bilateral", "atrous" or "none".
       radius, eps: of the filter, as in `DenoiseSettings`; None goes by its rule, or by cross-validation.
       auto: whether by cross-validation; None is from `AUTO_FROM` samples on.
-      ao_rays: rays of ambient occlusion per pixel, a guide of the filter; None is 8 below 4 samples, else 0, where the
-        paths' own first hits are enough.
+      ao_rays: rays of ambient occlusion per pixel, a guide of the filter; None is 8 below 4 samples and without
+        bounces, else 0, where the paths' own first hits are enough.
       direct: how noise of soft shadows is met. "plain" averages samples; "ratio" multiplies unshadowed light by a
         filtered share of it that arrives (`shadow_ratio`); None takes the latter below `PLAIN_FROM` samples.
       seed: of all random numbers.
@@ -56,6 +56,8 @@ class TraceSettings:
         if self.bounces > MOST_BOUNCES:
             raise ValueError(f"bounces: expected at most {MOST_BOUNCES}, got {self.bounces}")
         checks.check_at_least("samples_per_pixel", self.samples_per_pixel, 1)
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"seed: expected a number from 0 to {2**31 - 1}, got {self.seed}")
         checks.check_at_least("light_samples", self.light_samples, 1)
         checks.check_one_of("model", self.model, MODELS)
         checks.check_one_of("method", self.method, METHODS)
@@ -83,4 +85,4 @@ class TraceSettings:
     def num_ao_rays(self) -> int:
         if self.ao_rays is not None:
             return self.ao_rays
-        return 8 if self.samples_per_pixel < 4 else 0
+        return 8 if self.samples_per_pixel < 4 or self.bounces == 0 else 0

@@ -323,6 +323,18 @@ def test_pools_of_samples_are_those_of_one_run():
     np.testing.assert_array_equal(both.odd, lone[1].incident)
 
 
+def test_occlusion_without_bounces_and_in_several_runs_is_of_rays_of_its_own():
+    """Rays of ambient occlusion where there are no paths; those of a later run are others."""
+    assert TraceSettings(samples_per_pixel=16, bounces=0).num_ao_rays == 8
+    assert TraceSettings(samples_per_pixel=16, bounces=1).num_ao_rays == 0
+    world = prepare(room(floor(), sphere(matt((0.7, 0.3, 0.2)), radius=0.5)), environment=WHITE)
+    settings = dataclasses.replace(PLAIN, bounces=0, ao_rays=2)
+    runs = [trace_guides(world, ABOVE, settings=settings, first_sample=k, **SIZE).ao for k in (0, 1)]
+    four = trace_guides(world, ABOVE, settings=dataclasses.replace(settings, ao_rays=4), **SIZE).ao
+    np.testing.assert_allclose(four, np.mean(runs, axis=0), atol=1e-6)
+    assert (runs[0] != runs[1]).any() and four.min() < 0.9
+
+
 def test_direct_and_indirect_alone():
     world = prepare(room(floor(), sphere(matt((0.7, 0.3, 0.2)), radius=0.5)), environment=WHITE)
     guides = trace_guides(world, ABOVE, settings=PLAIN, **SIZE)

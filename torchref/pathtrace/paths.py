@@ -36,7 +36,7 @@ class Vertex(NamedTuple):
 
     number: int | Int[Tensor, ""]
     drawn: int
-    scattered: int
+    scattered: int | Float[Tensor, ""]
     model: str
 
 
