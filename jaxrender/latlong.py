@@ -7,6 +7,7 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxrender.vec3 import Scalar, Vec3
 
@@ -40,3 +41,24 @@ def to_direction(cosine: Scalar, azimuth: Scalar) -> Vec3:
     """The unit direction of a cosine of the polar angle, in [-1, 1], and of an azimuth."""
     radius = jnp.sqrt(jnp.maximum(1.0 - cosine * cosine, 0.0))
     return Vec3(radius * jnp.sin(azimuth), cosine, -radius * jnp.cos(azimuth))
+
+
+def look_up_smoothly(image: Float[Array, "h w c"], direction: Vec3) -> Float[Array, "*b c"]:
+    """What an image shows in unit directions: bilinear between the middles of pixels, closed around.
+
+    Differentiable in the image.
+    """
+    height, width = image.shape[:2]
+    theta, phi = to_angles(direction)
+    down = jnp.clip(theta * (height / math.pi) - 0.5, 0.0, height - 1.0)
+    across = (phi + math.pi) * (width / (2.0 * math.pi)) - 0.5
+    row, column = jnp.floor(down), jnp.floor(across)
+    shares = (down - row)[..., None], (across - column)[..., None]
+    row, column = row.astype(jnp.int32), column.astype(jnp.int32)
+    total = jnp.zeros((*theta.shape, image.shape[2]), image.dtype)
+    for below in (0, 1):
+        for right in (0, 1):
+            pixel = image[jnp.minimum(row + below, height - 1), (column + right) % width]
+            share = (shares[0] if below else 1.0 - shares[0]) * (shares[1] if right else 1.0 - shares[1])
+            total = total + pixel * share
+    return total

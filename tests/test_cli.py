@@ -91,7 +91,10 @@ def test_interrupt_says_what_was_kept(capsys):
     assert capsys.readouterr().err == "interrupted; 12 frames are in out/bake; the same command goes on from there\n"
 
 
-def test_interrupt_of_a_real_process():
+@pytest.mark.parametrize(
+    ("number", "status", "said"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+)
+def test_interrupt_of_a_real_process(number, status, said):
     code = """
 import signal, time
 from jaxrender import console
@@ -104,9 +107,9 @@ raise SystemExit(console.run_command(main))
 """
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "ready\n"
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, err = process.communicate(timeout=30)
-    assert process.returncode == 130 and err == "interrupted; kept\n"
+    assert process.returncode == status and err == f"{said}; kept\n"
 
 
 def test_a_reader_that_goes_away():

@@ -3,6 +3,7 @@
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchref._precision import in_float64
@@ -40,3 +41,16 @@ def to_direction(cosine: Scalar, azimuth: Scalar) -> Vec3:
     """(sin θ sin φ, cos θ, -sin θ cos φ)."""
     sine = torch.sin(torch.acos(cosine))
     return Vec3(sine * torch.sin(azimuth), cosine, -sine * torch.cos(azimuth))
+
+
+@in_float64
+def look_up_smoothly(image: Float[Tensor, "h w c"], direction: Vec3) -> Float[Tensor, "*b c"]:
+    """Σ max(0, 1 - |distance in rows|) max(0, 1 - |distance in columns|) value, over all pixels' middles."""
+    height, width = image.shape[:2]
+    polar, azimuth = to_angles(direction)
+    y = (polar / math.pi * height - 0.5).clamp(0.0, height - 1.0)[..., None]
+    x = ((azimuth / (2.0 * math.pi) + 0.5) * width - 0.5)[..., None]
+    apart = torch.remainder(x - torch.arange(width), width)
+    of_row = (1.0 - (y - torch.arange(height)).abs()).clamp(min=0.0)
+    of_column = (1.0 - torch.minimum(apart, width - apart)).clamp(min=0.0)
+    return torch.einsum("...h,...w,hwc->...c", of_row, of_column, image)

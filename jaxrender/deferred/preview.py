@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 
 from jaxrender.camera import Camera, camera_rays, clip_from_world, depth_range
 from jaxrender.deferred.interpolate import interpolate
 from jaxrender.deferred.raster import Fragments, rasterize
 from jaxrender.deferred.samples import ordered_grid
-from jaxrender.latlong import to_angles
+from jaxrender.latlong import look_up_smoothly
 from jaxrender.vec3 import from_array
 from jaxrender.vecmath import matmul
 
@@ -96,12 +96,10 @@ def environment_background(
       environment: row 0 is +Y, the middle looks down -Z, columns turn towards +X.
     """
     _, directions = camera_rays(camera, height=height, width=width)
-    theta, phi = (np.asarray(angle, np.float64) for angle in to_angles(from_array(directions)))
-    eh, ew = environment.shape[:2]
-    row, column = theta / np.pi * eh - 0.5, (phi / (2 * np.pi) + 0.5) * ew - 0.5
-    where = np.stack([np.clip(row, 0, eh - 1), column])
-    channels = [map_coordinates(c, where, order=1, mode="grid-wrap") for c in np.moveaxis(environment, -1, 0)]
-    return np.stack(channels, axis=-1).astype(np.float32)
+    return np.asarray(_look_up(jnp.asarray(environment, jnp.float32), from_array(directions)))
+
+
+_look_up = jax.jit(look_up_smoothly)
 
 
 def render_vertex_colors(

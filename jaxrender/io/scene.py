@@ -22,11 +22,8 @@ def load_scene(path: str | pathlib.Path) -> Scene:
         is missing or damaged is a line in `Scene.notes` instead.
       OSError: if it cannot be read.
     """
-    path = pathlib.Path(path)
-    with open(path, "rb") as file:
-        start = file.read(4)
-    ending = path.suffix.lower()
-    if start == b"glTF" or ending in (".gltf", ".glb"):
+    path, start, ending = _looked_at(path)
+    if _is_gltf(start, ending):
         return read_gltf_scene(path)
     if start[:3] == b"ply":
         return read_mesh_scene(path, kind="ply")
@@ -48,9 +45,18 @@ def load_animated_scene(path: str | pathlib.Path) -> AnimatedScene:
       InputError: if the file is no glTF, or as in `load_scene`.
       OSError: if it cannot be read.
     """
-    path = pathlib.Path(path)
-    with open(path, "rb") as file:
-        start = file.read(4)
-    if start == b"glTF" or path.suffix.lower() in (".gltf", ".glb"):
+    path, start, ending = _looked_at(path)
+    if _is_gltf(start, ending):
         return read_gltf_animated(path)
     return bad_input(path, "file", expected="a scene with clips (glTF or GLB)", got=f"ending {path.suffix or 'none'}")
+
+
+def _looked_at(path: str | pathlib.Path) -> tuple[pathlib.Path, bytes, str]:
+    """The path, the first bytes of the file, and its ending in small letters."""
+    path = pathlib.Path(path)
+    with open(path, "rb") as file:
+        return path, file.read(4), path.suffix.lower()
+
+
+def _is_gltf(start: bytes, ending: str) -> bool:
+    return start == b"glTF" or ending in (".gltf", ".glb")

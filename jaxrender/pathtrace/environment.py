@@ -82,27 +82,6 @@ def look_up(environment: Environment, direction: Vec3) -> FarLight:
     return _at(environment, direction, *texel_of(environment, direction))
 
 
-def background(environment: Environment, direction: Vec3) -> Vec3:
-    """The radiance that an eye sees in a unit direction: bilinear between the middles of texels, closed around.
-
-    Light is drawn and met texel by texel; only what is seen directly is smooth.
-    """
-    height, width = environment.density.shape
-    theta, phi = to_angles(direction)
-    down = jnp.clip(theta * (height / math.pi) - 0.5, 0.0, height - 1.0)
-    across = (phi + math.pi) * (width / (2.0 * math.pi)) - 0.5
-    row, column = jnp.floor(down), jnp.floor(across)
-    shares = down - row, across - column
-    row, column = row.astype(jnp.int32), column.astype(jnp.int32)
-    total = Vec3(*(jnp.zeros_like(theta),) * 3)
-    for below in (0, 1):
-        for right in (0, 1):
-            texel = environment.radiance[jnp.minimum(row + below, height - 1), (column + right) % width]
-            share = (shares[0] if below else 1.0 - shares[0]) * (shares[1] if right else 1.0 - shares[1])
-            total = total + from_array(texel) * share
-    return total
-
-
 def draw_direction(environment: Environment, u: Scalar, v: Scalar) -> FarLight:
     """A direction by brightness, from two uniform numbers in [0, 1)."""
     height, width = environment.density.shape

@@ -16,11 +16,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxrender import vec3
 from jaxrender.camera import Camera, look_at, project_px
+from jaxrender.latlong import look_up_smoothly
 from jaxrender.machine import num_cores
 from jaxrender.pathtrace import paths
 from jaxrender.pathtrace.backends import on_the_device
 from jaxrender.pathtrace.emitters import Emitters
-from jaxrender.pathtrace.environment import Environment, background
 from jaxrender.pathtrace.guide_lookup import guide_lookup
 from jaxrender.pathtrace.hit_points import (
     HitPoints,
@@ -110,7 +110,7 @@ def see(
     hits, surface = hit(world, rays, path.alive, view.step)
     emission = meet(world.emitters, path, rays.direction, hits.t, surface, left=Vertex(-1, 0, 1, model))
     if world.emitters.environment is not None:
-        emission = _before_the_sky(world.emitters.environment, rays.direction, surface.triangle, emission)
+        emission = _before_the_sky(world.emitters.environment.radiance, rays.direction, surface.triangle, emission)
     at, path = arrive(path, rays.direction, surface, model=model)
     path, images = _look(view, at, path, by_ratio=by_ratio)
     return at, path, images | {"emission": emission}
@@ -274,9 +274,11 @@ def _look(view: View, at: Reflector, path: Path, *, by_ratio: bool) -> tuple[Pat
 
 
 @jax.jit
-def _before_the_sky(environment: Environment, direction: Vec3, triangle: Int[Array, " n"], emission: Vec3) -> Vec3:
-    """The emission of what is seen, and a smooth background."""
-    return vec3.where(triangle < 0, background(environment, direction), emission)
+def _before_the_sky(
+    sky: Float[Array, "h w 3"], direction: Vec3, triangle: Int[Array, " n"], emission: Vec3
+) -> Vec3:  # fmt: skip
+    """The emission of what is seen, and a smooth background: light is drawn and met texel by texel."""
+    return vec3.where(triangle < 0, vec3.from_array(look_up_smoothly(sky, direction)), emission)
 
 
 @jax.jit

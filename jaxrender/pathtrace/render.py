@@ -36,8 +36,6 @@ from jaxrender.vec3 import Scalar, Vec3
 #: Of a picture; they add up to it.
 PARTS = ("direct", "indirect", "emission")
 
-# As the filters do it.
-_FIREFLY_FACTOR = 16.0
 # Radii that are wanted this near below one are not worth another.
 _NEAR = 0.5
 
@@ -121,7 +119,7 @@ def filter_incident(guides: Traced, settings: TraceSettings) -> tuple[np.ndarray
         chosen = dataclasses.replace(chosen, eps=float(found.chosen["eps"]))
         narrower = [
             denoise(aovs, settings=dataclasses.replace(chosen, radius=radius)).layers["indirect"]
-            if radius else np.asarray(_clamped(guides.incident)) for radius in radii[1:]
+            if radius else np.asarray(_clamped(guides.incident, chosen.firefly_factor)) for radius in radii[1:]
         ]  # fmt: skip
         light = np.asarray(_blend(np.stack([light, *narrower]), np.asarray(radii, np.float32), wanted))
     return light, {name: value for name, value in found.chosen.items() if name != "filtered"}
@@ -196,9 +194,9 @@ def _block(
 _blend = jax.jit(blend_windows)
 
 
-@jax.jit
-def _clamped(light: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
-    return clamp_fireflies(light, factor=_FIREFLY_FACTOR)[0]
+@functools.partial(jax.jit, static_argnames="factor")
+def _clamped(light: Float[Array, "h w 3"], factor: float | None) -> Float[Array, "h w 3"]:
+    return light if factor is None else clamp_fireflies(light, factor=factor)[0]
 
 
 @jax.jit

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import errno
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -354,20 +353,3 @@ def test_too_little_memory_ends_with_one_line_and_keeps_what_is_done(data, tmp_p
     assert line.startswith("jaxrender: error: not enough memory: ") and line.endswith(f"; kept in {folder}")
     assert len(list((folder / "unfinished" / "fit").glob("0*.part"))) == 1
     assert small_run(data, folder) == small_run(data, tmp_path / "whole")
-
-
-def test_sigterm_is_taken_like_ctrl_c():
-    code = """
-import time
-from jaxrender import console
-def main():
-    with console.keeping("kept"):
-        print("ready", flush=True)
-        time.sleep(60)
-raise SystemExit(console.run_command(main))
-"""
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "ready\n"
-    process.send_signal(signal.SIGTERM)
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 143 and err == "terminated; kept\n"

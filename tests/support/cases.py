@@ -1864,8 +1864,8 @@ def _sharpness() -> list[Case]:
 
 
 def _backgrounds() -> list[Case]:
-    inputs = {"environment": _environment_record(), "direction": _vec(_unit(40))}
-    return [Case("pathtrace.environment.background", inputs)]
+    inputs = {"image": _uniform(0.0, 2.0, 5, 6, 3), "direction": _vec(_unit(40))}
+    return [Case("latlong.look_up_smoothly", inputs, gradients=("image",))]
 
 
 def _motion() -> list[Case]:

@@ -64,20 +64,6 @@ def look_up(environment: Environment, direction: Vec3) -> FarLight:
 
 
 @in_float64
-def background(environment: Environment, direction: Vec3) -> Vec3:
-    """Σ max(0, 1 - |distance in rows|) max(0, 1 - |distance in columns|) radiance, over all texels' middles."""
-    height, width = environment.density.shape
-    polar, azimuth = to_angles(direction)
-    y = (polar / math.pi * height - 0.5).clamp(0.0, height - 1.0)[..., None]
-    x = ((azimuth / (2.0 * math.pi) + 0.5) * width - 0.5)[..., None]
-    columns = torch.arange(width)
-    apart = torch.remainder(x - columns, width)
-    of_row = (1.0 - (y - torch.arange(height)).abs()).clamp(min=0.0)
-    of_column = (1.0 - torch.minimum(apart, width - apart)).clamp(min=0.0)
-    return from_array(torch.einsum("...h,...w,hwc->...c", of_row, of_column, environment.radiance))
-
-
-@in_float64
 def draw_direction(environment: Environment, u: Scalar, v: Scalar) -> FarLight:
     """Inverts the distribution of rows, then that of the columns of the row; uniform in solid angle within a texel."""
     height, width = environment.density.shape
